@@ -1,0 +1,75 @@
+"""From a commanded velocity to each agent model's own inputs.
+
+Consensus laws say where an agent's position should go; what it takes to go there depends on the model. A model that
+the library doesn't know gets an entry of its own: `VELOCITY_CONTROLLERS["my_type"] = my_function`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from khop_env.observers import FloatArray
+from khop_env.physics import AgentModel, DoubleIntegrator, SurfaceVessel
+
+VelocityController = Callable[..., FloatArray]
+
+VELOCITY_RATE = 2.0  # 1/s: how fast a velocity error is meant to decay where the input is a force or an acceleration
+OFFSET = 0.3  # m ahead of a unicycle's axle: the point whose velocity is commanded
+
+
+def _direct(model: AgentModel, x: FloatArray, velocity: FloatArray) -> FloatArray:
+    """The input is the velocity."""
+    return velocity
+
+
+def _double_integrator(model: DoubleIntegrator, x: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Cancel the damping and let the velocity error decay."""
+    speed = x[..., 2:]
+    return model.damping * speed + VELOCITY_RATE * (velocity - speed)
+
+
+def _unicycle(model: AgentModel, x: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Feedback linearisation about the point OFFSET ahead (d'Andrea-Novel, Campion and Bastin, 1995)."""
+    cos, sin = np.cos(x[..., 2]), np.sin(x[..., 2])
+    vx, vy = velocity[..., 0], velocity[..., 1]
+    return np.stack([cos * vx + sin * vy, (cos * vy - sin * vx) / OFFSET], axis=-1)
+
+
+def _vessel(model: SurfaceVessel, x: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Body velocities follow the rotated command and the yaw rate is damped; drag helps, so it isn't cancelled."""
+    cos, sin = np.cos(x[..., 2]), np.sin(x[..., 2])
+    vx, vy = velocity[..., 0], velocity[..., 1]
+    wanted = np.stack([cos * vx + sin * vy, cos * vy - sin * vx, np.zeros_like(vx)], axis=-1)
+    return np.array(model.mass) * VELOCITY_RATE * (wanted - x[..., 3:])
+
+
+VELOCITY_CONTROLLERS: dict[str, VelocityController] = {
+    "integrator": _direct,
+    "drifter": _direct,
+    "cart": _double_integrator,
+    "unicycle": _unicycle,
+    "vessel": _vessel,
+}
+
+
+def velocity_to_input(model: AgentModel, x: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Inputs (..., m) that make the position of agents of `model` follow `velocity` (..., d), within the limits.
+
+    Args:
+        model: the agents' common model.
+        x: (..., n) their states.
+        velocity: (..., d) commanded velocities in m/s.
+
+    Raises:
+        ValueError: for a model without an entry in `VELOCITY_CONTROLLERS`.
+    """
+    controller = VELOCITY_CONTROLLERS.get(model.type)
+    if controller is None:
+        raise ValueError(
+            f"no velocity controller for agents of type {model.type!r}; there is one for "
+            f"{', '.join(VELOCITY_CONTROLLERS)}. Add yours: VELOCITY_CONTROLLERS[{model.type!r}] = function(model, x, v)"
+        )
+    u = controller(model, x, velocity)
+    return np.minimum(np.maximum(u, -model.input_limit), model.input_limit)

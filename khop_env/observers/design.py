@@ -1,0 +1,223 @@
+"""The design rule: from bounds on the estimation errors (delta, theta) to funnels on the disagreements (rho, omega).
+
+The norm of the funnels of one target may be at most lambda_min(M_i) times the smallest of its observers' bounds
+(Problem 2 of the paper). With one bound delta_i per target and component, all its eta_i observers get
+
+    rho_i(t) = lambda_min(M_i) / sqrt(eta_i) * delta_i(t).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import networkx as nx
+import numpy as np
+
+from khop_env.observers.layout import FloatArray, PairLayout
+from khop_env.observers.performance import FunnelBank, PerformanceFunction, scaled
+from khop_env.physics import Fleet, k_hop_neighbors, validate_graph
+
+Bound = PerformanceFunction | Sequence[PerformanceFunction]
+"""A bound on a target's estimation error: one function for all its components, or one for each."""
+
+
+class DesignError(ValueError):
+    """The observers can't be designed as asked; the message says which number would do."""
+
+
+@dataclass(frozen=True)
+class TargetObservers:
+    """Which simplification the observers of one target use.
+
+    Attributes:
+        drift: whether the observers know f_i (without it the agent's motion has to be bounded: Theorem 2).
+        input_observer: whether g_i(u_i) is estimated too (PPIO; needs a bounded derivative of g_i: Theorem 3). Without
+            it g_i has to be bounded (the remark on Theorem 1) and counts as a disturbance.
+    """
+
+    drift: bool = True
+    input_observer: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Funnels:
+    """The funnels of one kind of observer: a layout, the bounds on the errors, and what the design rule makes of them.
+
+    Attributes:
+        layout: who estimates whom.
+        bounds: per row of the layout, delta (or theta): the bound on the estimation error.
+    """
+
+    layout: PairLayout
+    bounds: tuple[PerformanceFunction, ...]
+
+    @cached_property
+    def gain(self) -> FloatArray:
+        """(rows,) lambda_min(M_i) / sqrt(eta_i) of each row's target: what the design rule multiplies delta by."""
+        per_target = self.layout.eigenvalues[:, 0] / np.sqrt(self.layout.plan[:, 0])
+        return per_target[self.layout.row_target]
+
+    @cached_property
+    def delta(self) -> FunnelBank:
+        """The bounds on the estimation errors, row by row."""
+        return FunnelBank(self.bounds)
+
+    @cached_property
+    def rho(self) -> FunnelBank:
+        """The funnels on the disagreements that the design rule gives, row by row."""
+        return FunnelBank([scaled(bound, gain) for bound, gain in zip(self.bounds, self.gain, strict=True)])
+
+    def largest_relay(self) -> FloatArray:
+        """(rows,) h_max: with one common first guess c the disagreement starts as xi = H (c - x_i)."""
+        plan = self.layout.plan
+        per_target = np.array([self.layout.relay[pair : pair + eta].max() for eta, *_, pair in plan])
+        return per_target[self.layout.row_target] if len(plan) else np.zeros(0)
+
+    def feasible_at_start(self, radius: FloatArray) -> FloatArray:
+        """(rows,) largest |xi(0)| over the initial set, as a fraction of rho(0): must be below 1.
+
+        Args:
+            radius: (n,) how far the true component may start from the observers' common first guess.
+        """
+        start = self.rho.evaluate(np.zeros(1), np.empty((self.layout.rows, 1)))[:, 0]
+        return self.largest_relay() * radius[self.layout.row_source] / start
+
+    def smallest_initial_bound(self, radius: FloatArray) -> FloatArray:
+        """(rows,) the infimum of the delta(0) that are feasible for the initial set; take any larger one.
+
+        Args:
+            radius: as in `feasible_at_start`.
+        """
+        return self.largest_relay() * radius[self.layout.row_source] / self.gain
+
+    def explicit_step_bound(self) -> FloatArray:
+        """(targets,) no explicit Euler step longer than this (s) is stable at steady state, even at e = 0.
+
+        Its linearisation there is 2 / (lambda_max(M_i) phi''(0) / rho(inf)^2) with phi''(0) = 4. Off centre the bound
+        shrinks a hundredfold, so a step has to stay far below it.
+        """
+        floor = self.rho.infimum()
+        per_target = np.full(len(self.layout.target), np.inf)
+        np.minimum.at(per_target, self.layout.row_target, floor)
+        return 0.5 * per_target**2 / self.layout.eigenvalues[:, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverDesign:
+    """All observers of a fleet: k-hop sets, layouts and funnels of the state and the input observers.
+
+    Args:
+        fleet: the agents.
+        communication: their communication graph, nodes 0..N-1, connected.
+        k: estimate agents up to k hops away.
+        delta: bound on the state estimation errors: one performance function for all, or one `Bound` per target.
+        theta: likewise for the input estimation errors; may be None where no target has an input observer.
+        relay: whether agents relay their neighbours' states (Assumption 4); without it 1-hop neighbours are estimated
+            too, from what the target itself sends (the paper's remarks).
+        targets: per agent which observers it gets; a `TargetObservers()` each by default, without the input observer
+            where the input map depends on the state.
+
+    Raises:
+        DesignError: an input observer for an agent whose g depends on its state, none for one whose g is unbounded,
+            or a missing or misshapen bound.
+        ValueError: a graph that isn't undirected, connected and labelled 0..N-1.
+    """
+
+    fleet: Fleet
+    communication: nx.Graph
+    k: int
+    delta: PerformanceFunction | Mapping[int, Bound]
+    theta: PerformanceFunction | Mapping[int, Bound] | None = None
+    relay: bool = True
+    targets: Sequence[TargetObservers] | None = None
+    neighborhoods: tuple[tuple[int, ...], ...] = field(init=False)
+    options: tuple[TargetObservers, ...] = field(init=False)
+    states: Funnels = field(init=False)
+    inputs: Funnels = field(init=False)
+
+    def __post_init__(self) -> None:
+        fleet = self.fleet
+        validate_graph(self.communication, len(fleet))
+        options = self.targets or [TargetObservers(input_observer=not m.input_map_uses_state) for m in fleet.models]
+        if len(options) != len(fleet):
+            raise DesignError(f"targets has {len(options)} entries, the fleet {len(fleet)} agents; give one per agent")
+        for i, (model, option) in enumerate(zip(fleet.models, options, strict=True)):
+            if option.input_observer and model.input_map_uses_state:
+                raise DesignError(
+                    f"agent {fleet.ids[i]!r} can't have an input observer: its input map g(x, u) depends on its state, "
+                    "and Theorem 3 is about g(u); set input_observer=False for it"
+                )
+            if not option.input_observer and not model.input_map_bounded:
+                raise DesignError(
+                    f"agent {fleet.ids[i]!r} can't do without an input observer: its input map is unbounded "
+                    "(Assumption 2-i); give its inputs finite limits or set input_observer=True"
+                )
+        neighborhoods = k_hop_neighbors(self.communication, self.k, relay=self.relay)
+        dimensions = [model.n for model in fleet.models]
+        observed_inputs = [i for i, option in enumerate(options) if option.input_observer]
+        if observed_inputs and self.theta is None:
+            raise DesignError(
+                f"theta is missing: {len(observed_inputs)} agents have an input observer, the first "
+                f"{fleet.ids[observed_inputs[0]]!r}; give a bound theta or set input_observer=False"
+            )
+        common = {"dimensions": dimensions, "offsets": fleet.state_offset, "relay": self.relay}
+        states = PairLayout.build(self.communication, neighborhoods, **common)
+        inputs = PairLayout.build(self.communication, neighborhoods, targets=observed_inputs, **common)
+        values = {
+            "neighborhoods": neighborhoods,
+            "options": tuple(options),
+            "states": Funnels(states, self._rows(states, self.delta, "delta")),
+            "inputs": Funnels(inputs, self._rows(inputs, self.theta, "theta")),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _rows(
+        self, layout: PairLayout, bounds: PerformanceFunction | Mapping[int, Bound] | None, name: str
+    ) -> tuple[PerformanceFunction, ...]:
+        """One performance function per row of the layout."""
+        rows: list[PerformanceFunction] = []
+        for i, (_, n, *_) in zip(layout.target, layout.plan, strict=True):
+            bound = bounds
+            if isinstance(bounds, Mapping):
+                if int(i) not in bounds:
+                    raise DesignError(f"{name} has no bound for agent {self.fleet.ids[i]!r}; give one per target")
+                bound = bounds[int(i)]
+            several = list(bound) if isinstance(bound, Sequence) else [bound] * int(n)
+            if len(several) != n or not all(isinstance(one, PerformanceFunction) for one in several):
+                raise DesignError(
+                    f"{name} of agent {self.fleet.ids[i]!r}: expected a performance function or a sequence of {n}, one "
+                    f"per state component, got {bound!r}"
+                )
+            rows.extend(several)  # type: ignore[arg-type]
+        return tuple(rows)
+
+    def require_feasible_start(self, state_radius: FloatArray, input_radius: FloatArray) -> None:
+        """Refuse funnels that the initial set doesn't fit into.
+
+        Args:
+            state_radius: (n,) how far each component of x may start from the observers' first guess.
+            input_radius: (n,) likewise for g_i(u_i).
+
+        Raises:
+            DesignError: naming the agent and component, |xi(0)| and rho(0), and the smallest delta(0) that would do.
+        """
+        for kind, funnels, radius, letters in (
+            ("state", self.states, state_radius, ("xi", "rho", "delta")),
+            ("input", self.inputs, input_radius, ("mu", "omega", "theta")),
+        ):
+            share = funnels.feasible_at_start(radius)
+            if not np.any(share >= 1.0):
+                continue
+            row = int(np.argmax(share))
+            agent, component, _ = self.fleet.component_names()[funnels.layout.row_source[row]]
+            xi, rho, delta = letters
+            start = float(funnels.rho.functions[row](np.zeros(1))[0])
+            bound = float(funnels.bounds[row](np.zeros(1))[0])
+            raise DesignError(
+                f"the {kind} observers of {agent!r} can't start inside their funnel: component {component!r} may have "
+                f"|{xi}(0)| = {share[row] * start:.4g}, but {rho}(0) = {start:.4g} (from {delta}(0) = {bound:.4g}); "
+                f"take {delta}(0) above {funnels.smallest_initial_bound(radius)[row]:.4g}, or a smaller initial set"
+            )

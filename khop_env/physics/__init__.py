@@ -1,0 +1,59 @@
+"""The world: what would be true were nobody watching.
+
+Agent models f_i and g_i, disturbances w_i, the fleet that joins them into flat batched vectors, and the graphs that
+say who hears whom. Everything here is a pure function of (t, x, u); randomness is drawn once per episode.
+"""
+
+from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean
+from khop_env.physics.disturbance import AttachedDisturbance, Channels, Disturbance, Sum, Term
+from khop_env.physics.disturbances import DISTURBANCES, BandLimitedNoise, Coupling, Gust, Sinusoid
+from khop_env.physics.fleet import Fleet, Group
+from khop_env.physics.graph import (
+    check_task_graph,
+    hop_distances,
+    k_hop_neighbors,
+    paper_tree,
+    random_geometric_graph,
+    validate_graph,
+)
+from khop_env.physics.models import (
+    MODELS,
+    DoubleIntegrator,
+    DriftingIntegrator,
+    SingleIntegrator,
+    SurfaceVessel,
+    Unicycle,
+    drifting_integrator_drift,
+)
+
+__all__ = [
+    "DISTURBANCES",
+    "MODELS",
+    "AgentModel",
+    "AttachedDisturbance",
+    "BandLimitedNoise",
+    "Channels",
+    "Coupling",
+    "Disturbance",
+    "DoubleIntegrator",
+    "DriftingIntegrator",
+    "Fleet",
+    "FloatArray",
+    "Group",
+    "Gust",
+    "IndexArray",
+    "SingleIntegrator",
+    "Sinusoid",
+    "Sum",
+    "SurfaceVessel",
+    "Term",
+    "Unicycle",
+    "check_task_graph",
+    "did_you_mean",
+    "drifting_integrator_drift",
+    "hop_distances",
+    "k_hop_neighbors",
+    "paper_tree",
+    "random_geometric_graph",
+    "validate_graph",
+]

@@ -1,0 +1,241 @@
+"""The fleet: many agents of several kinds, evaluated as flat batched vectors.
+
+A fleet's state is (B, n): one row per environment, the agents' states one after the other. Agents may differ in
+n_i and m_i; offsets say where each begins, and neighbours of one model are evaluated in one call.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """A maximal run of consecutive agents with equal models.
+
+    Their states are the view `x[:, group.state_slice].reshape(B, group.size, group.model.n)`.
+
+    Attributes:
+        model: Their common model.
+        start: Index of the first agent.
+        stop: One past the index of the last.
+        state_slice: Their part of the fleet's flat state.
+        input_slice: Their part of the fleet's flat input.
+    """
+
+    model: AgentModel
+    start: int
+    stop: int
+    state_slice: slice
+    input_slice: slice
+
+    @property
+    def size(self) -> int:
+        """Number of agents."""
+        return self.stop - self.start
+
+
+class Fleet:
+    """Agents in a fixed order, and their joint drift and input map.
+
+    Args:
+        models: One model per agent. Agents whose models are equal may be one object or several.
+
+    Attributes:
+        models: The models, one per agent.
+        ids: "<type>_<index>" per agent; the index counts within the type.
+        n: Number of states of all agents together.
+        m: Number of inputs of all agents together.
+        state_offset: Where each agent's states begin, and n at the end, shape (N + 1,).
+        input_offset: Where each agent's inputs begin, and m at the end, shape (N + 1,).
+        groups: Runs of agents evaluated together.
+        position_dim: Dimension d of a position, the same for all agents.
+        position_index: Where each agent's position sits in the flat state, shape (N, d).
+        input_limit: Symmetric input bounds, shape (m,).
+        input_map_bound: Bounds on the components of |g|, shape (n,).
+
+    Raises:
+        ValueError: There are no models, one isn't a model, positions differ in dimension, or agents of one type differ
+            in their states or inputs.
+    """
+
+    def __init__(self, models: Sequence[AgentModel]) -> None:
+        self.models: tuple[AgentModel, ...] = tuple(models)
+        if not self.models:
+            raise ValueError("a fleet needs at least one agent model")
+        for i, model in enumerate(self.models):
+            if not isinstance(model, AgentModel):
+                hint = "; write the parentheses to make an instance" if isinstance(model, type) else ""
+                raise ValueError(f"agent {i}: expected an AgentModel, got {model!r}{hint}")
+            model.validate()
+        self.ids = _number_within_type(self.models)
+        self._index = {name: i for i, name in enumerate(self.ids)}
+        _check_types(self.models, self.ids)
+
+        self.state_offset = _offsets([model.n for model in self.models])
+        self.input_offset = _offsets([model.m for model in self.models])
+        self.n = int(self.state_offset[-1])
+        self.m = int(self.input_offset[-1])
+        self.groups = self._runs()
+
+        positions = [group.model.position_index for group in self.groups for _ in range(group.size)]
+        self.position_dim = _common_dimension(positions, self.ids)
+        self.position_index: IndexArray = np.array(positions) + self.state_offset[:-1, None]
+        self.input_limit: FloatArray = np.concatenate([model.input_limit for model in self.models])
+        self.input_map_bound: FloatArray = np.concatenate(
+            [np.tile(group.model.input_map_bound(), group.size) for group in self.groups]
+        )
+
+    def __len__(self) -> int:
+        """Number of agents N."""
+        return len(self.models)
+
+    def __repr__(self) -> str:
+        counts = Counter(model.type for model in self.models)
+        return f"Fleet({', '.join(f'{count} {kind}' for kind, count in counts.items())})"
+
+    def state_slice(self, agent: int) -> slice:
+        """Agent's part of the flat state."""
+        return slice(int(self.state_offset[agent]), int(self.state_offset[agent + 1]))
+
+    def input_slice(self, agent: int) -> slice:
+        """Agent's part of the flat input."""
+        return slice(int(self.input_offset[agent]), int(self.input_offset[agent + 1]))
+
+    def agent(self, which: str | int) -> int:
+        """Index of an agent, given its id or its index.
+
+        Raises:
+            ValueError: There is no such agent.
+        """
+        if isinstance(which, str):
+            if which not in self._index:
+                raise ValueError(f"no agent {which!r}; {did_you_mean(which, self.ids)}")
+            return self._index[which]
+        if not 0 <= which < len(self):
+            raise ValueError(f"no agent {which}: the fleet's agents are 0 to {len(self) - 1}")
+        return int(which)
+
+    def component_names(self) -> list[tuple[str, str, str]]:
+        """(agent id, state name, unit) of each component of the flat state."""
+        return [(i, *state) for i, model in zip(self.ids, self.models, strict=True) for state in model.states.items()]
+
+    def input_names(self) -> list[tuple[str, str, str]]:
+        """(agent id, input name, unit) of each component of the flat input."""
+        return [(i, *entry) for i, model in zip(self.ids, self.models, strict=True) for entry in model.inputs.items()]
+
+    def drift(self, t: FloatArray, x: FloatArray, out: FloatArray | None = None) -> FloatArray:
+        """The drift f of all agents.
+
+        Args:
+            t: Time of each environment in seconds, shape (B,).
+            x: Fleet states, shape (B, n).
+            out: Where to write the result, shape (B, n); a new array if left out.
+
+        Returns:
+            Rates of change, shape (B, n); never a view of x.
+
+        Raises:
+            ValueError: A model returned a wrong shape.
+        """
+        out = np.empty(x.shape) if out is None else out
+        t = t[:, None]
+        for group in self.groups:
+            states = self._of_group(x, group)
+            _fill(out, group, group.model.drift(t, states), states.shape, "drift(t, x)")
+        return out
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray, out: FloatArray | None = None) -> FloatArray:
+        """The input map g of all agents.
+
+        Args:
+            t: Time of each environment in seconds, shape (B,).
+            x: Fleet states, shape (B, n).
+            u: Fleet inputs, shape (B, m).
+            out: Where to write the result, shape (B, n); a new array if left out.
+
+        Returns:
+            Rates of change, shape (B, n); never a view of u.
+
+        Raises:
+            ValueError: A model returned a wrong shape.
+        """
+        out = np.empty(x.shape) if out is None else out
+        t = t[:, None]
+        for group in self.groups:
+            states = self._of_group(x, group)
+            inputs = u[:, group.input_slice].reshape(len(u), group.stop - group.start, -1)
+            _fill(out, group, group.model.input_map(t, states, inputs), states.shape, "input_map(t, x, u)")
+        return out
+
+    def positions(self, x: FloatArray) -> FloatArray:
+        """Positions of all agents, shape (B, N, d), from fleet states (B, n)."""
+        return np.take(x, self.position_index, axis=-1)
+
+    @staticmethod
+    def _of_group(x: FloatArray, group: Group) -> FloatArray:
+        return x[:, group.state_slice].reshape(
+            len(x), group.stop - group.start, -1
+        )  # a view: only the last axis splits
+
+    def _runs(self) -> tuple[Group, ...]:
+        firsts = [0, *(i for i in range(1, len(self)) if self.models[i] != self.models[i - 1])]
+        groups = []
+        for start, stop in zip(firsts, [*firsts[1:], len(self)], strict=True):
+            states = slice(int(self.state_offset[start]), int(self.state_offset[stop]))
+            inputs = slice(int(self.input_offset[start]), int(self.input_offset[stop]))
+            groups.append(Group(self.models[start], start, stop, states, inputs))
+        return tuple(groups)
+
+
+def _fill(out: FloatArray, group: Group, value: FloatArray, shape: tuple[int, ...], what: str) -> None:
+    # A copy even for a single group: a model may return its argument (g = u) and callers add into `out`.
+    if np.shape(value) != shape:
+        raise ValueError(
+            f"{group.model.__class__.__name__}.{what} returned shape {np.shape(value)}, expected {shape}: the leading "
+            f"axes of x, then the {group.model.n} states {tuple(group.model.states)}"
+        )
+    out[:, group.state_slice] = value.reshape(shape[0], -1)
+
+
+def _offsets(sizes: list[int]) -> IndexArray:
+    return np.concatenate([[0], np.cumsum(sizes)]).astype(np.intp)
+
+
+def _number_within_type(models: tuple[AgentModel, ...]) -> tuple[str, ...]:
+    seen: Counter[str] = Counter()
+    ids = []
+    for model in models:
+        ids.append(f"{model.type}_{seen[model.type]}")
+        seen[model.type] += 1
+    return tuple(ids)
+
+
+def _check_types(models: tuple[AgentModel, ...], ids: tuple[str, ...]) -> None:
+    first: dict[str, int] = {}
+    for i, model in enumerate(models):
+        other = first.setdefault(model.type, i)
+        for name in ("states", "inputs"):
+            mine, its = dict(getattr(model, name)), dict(getattr(models[other], name))
+            if mine != its:
+                raise ValueError(
+                    f"{ids[i]} and {ids[other]} share the type {model.type!r} but differ in their {name}: "
+                    f"{mine} and {its}; give one of the models another type"
+                )
+
+
+def _common_dimension(positions: list[IndexArray], ids: tuple[str, ...]) -> int:
+    common = Counter(map(len, positions)).most_common(1)[0][0]
+    odd = [f"{i} ({len(index)})" for i, index in zip(ids, positions, strict=True) if len(index) != common]
+    if odd:
+        raise ValueError(
+            f"all agents must share one position dimension; most have {common}, but not {', '.join(odd[:8])}"
+            f"{' and others' if len(odd) > 8 else ''}"
+        )
+    return common

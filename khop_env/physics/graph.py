@@ -1,0 +1,210 @@
+"""Communication and task graphs, and who is how many hops away.
+
+The paper's graph G = (V, E): agents are the nodes 0..N-1, an edge joins two that exchange messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import networkx as nx
+import numpy as np
+
+from khop_env.physics.agent_model import FloatArray
+
+_SHOWN = 8  # entries of a long list shown in an error message
+
+
+def validate_graph(graph: nx.Graph, agents: int, name: str = "communication graph", connected: bool = True) -> nx.Graph:
+    """Check that a graph is one the paper's Assumption 3 speaks of, with the agents as nodes.
+
+    Args:
+        graph: An undirected simple graph with the nodes 0..agents-1.
+        agents: Number of agents N.
+        name: What error messages call the graph.
+        connected: Whether the graph must be connected, as the theorems need of the communication graph.
+
+    Returns:
+        A frozen copy with its nodes in increasing order, so that matrices made from it are in the agents' order.
+
+    Raises:
+        ValueError: The graph is directed or a multigraph, is labelled otherwise, has a self-loop or isn't connected.
+    """
+    if not isinstance(graph, nx.Graph):
+        raise ValueError(f"{name}: expected a networkx.Graph, got {graph!r}")
+    if graph.is_directed() or graph.is_multigraph():
+        raise ValueError(f"{name}: expected an undirected simple networkx.Graph, got a {type(graph).__name__}")
+    missing = [node for node in range(agents) if node not in graph]
+    unexpected = [node for node in graph if not (isinstance(node, int | np.integer) and 0 <= node < agents)]
+    if missing or unexpected:
+        wrong = [f"missing {_listed(missing)}"] * bool(missing) + [f"unexpected {_listed(unexpected)}"] * bool(
+            unexpected
+        )
+        raise ValueError(f"{name}: the nodes must be exactly the integers 0 to {agents - 1}; {', '.join(wrong)}")
+    loops = list(nx.selfloop_edges(graph))
+    if loops:
+        raise ValueError(f"{name}: an agent can't be its own neighbour; remove the self-loops {_listed(loops)}")
+    if connected and not nx.is_connected(graph):
+        parts = [f"{{{_listed(sorted(part))}}}" for part in sorted(nx.connected_components(graph), key=min)]
+        raise ValueError(f"{name}: must be connected, but falls into {len(parts)} components: {_listed(parts)}")
+    tidy = nx.Graph()
+    tidy.add_nodes_from(range(agents))
+    tidy.add_edges_from(sorted((int(min(edge)), int(max(edge))) for edge in graph.edges))
+    return nx.freeze(tidy)
+
+
+def hop_distances(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
+    """Graph distances up to `cutoff`, by breadth-first search.
+
+    Args:
+        graph: A validated graph on 0..N-1.
+        cutoff: Largest distance of interest, in hops.
+
+    Returns:
+        For each agent, {agent: distance} of the agents within `cutoff` hops, itself included at 0, nearest first.
+    """
+    neighbors = [list(graph.adj[node]) for node in range(len(graph))]
+    distances = []
+    for source in range(len(neighbors)):
+        found = {source: 0}
+        frontier = [source]
+        for hops in range(1, cutoff + 1):
+            reached = []
+            for node in frontier:
+                for neighbor in neighbors[node]:
+                    if neighbor not in found:
+                        found[neighbor] = hops
+                        reached.append(neighbor)
+            frontier = reached
+        distances.append(found)
+    return distances
+
+
+def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[int, ...], ...]:
+    """The agents that estimate each agent, and whom it estimates: the paper's k-hop neighbours.
+
+    Args:
+        graph: A validated graph on 0..N-1.
+        k: Largest distance in hops.
+        relay: Whether agents relay their neighbours' states (Assumption 4). If not, direct neighbours are
+            estimated too (Remark 2).
+
+    Returns:
+        For each agent, sorted: the agents at distance 2..k, or 1..k without relay.
+
+    Raises:
+        ValueError: k leaves nothing to estimate: below 2, or below 1 without relay.
+    """
+    nearest = 2 if relay else 1
+    if k < nearest:
+        raise ValueError(f"k must be at least {nearest} {'with' if relay else 'without'} relay; got {k!r}")
+    return tuple(
+        tuple(sorted(agent for agent, hops in found.items() if hops >= nearest)) for found in hop_distances(graph, k)
+    )
+
+
+def check_task_graph(task: nx.Graph, communication: nx.Graph, k: int) -> nx.Graph:
+    """Check that both ends of each task edge know of each other: they are at most k hops apart.
+
+    Args:
+        task: Pairs of agents that a task relates; needn't be connected.
+        communication: A validated communication graph.
+        k: Number of hops up to which agents hear or estimate each other.
+
+    Returns:
+        The task graph, validated.
+
+    Raises:
+        ValueError: The task graph is malformed, or has edges that nobody could act on.
+    """
+    task = validate_graph(task, len(communication), name="task graph", connected=False)
+    within = hop_distances(communication, k)
+    far = [edge for edge in task.edges if edge[1] not in within[edge[0]]]
+    if far:
+        shown = [f"{edge} at distance {_distance(communication, *edge)}" for edge in far[:_SHOWN]]
+        rest = f" and {len(far) - _SHOWN} more" if len(far) > _SHOWN else ""
+        raise ValueError(
+            f"task graph: nobody could act on edges between agents more than k = {k} hops apart: "
+            f"{', '.join(shown)}{rest}"
+        )
+    return task
+
+
+def paper_tree() -> nx.Graph:
+    """A communication graph for the paper's 8-agent simulation, numbered from 0.
+
+    The figure isn't in the paper's text. Its published constants fix agent 4 (here 3): rho(inf) / delta(inf) =
+    0.02 / 0.117 = lambda_min(M_4) / sqrt(eta_4) with eta_4 = 5 and lambda_min(M_4) = (3 - sqrt(5)) / 2. The path
+    1-2-...-7 with agent 8 attached to 5 has exactly this for k = 3; other graphs have it too, so this is our choice.
+    """
+    return nx.Graph([*((i, i + 1) for i in range(6)), (4, 7)])
+
+
+def random_geometric_graph(agents: int, mean_degree: float, rng: np.random.Generator) -> tuple[nx.Graph, FloatArray]:
+    """Agents scattered over a square, joined to those in range and, so that all are connected, along a shortest tree.
+
+    Points are uniform on a square of side sqrt(N), one agent per unit area. Two are joined if they are closer
+    than sqrt(mean_degree / pi), or neighbours in the Euclidean minimum spanning tree.
+
+    Args:
+        agents: Number of agents N.
+        mean_degree: Expected number of agents in range of one that is far from the border; the border lowers the mean,
+            the tree raises it.
+        rng: Source of the positions.
+
+    Returns:
+        The graph, and the positions, shape (N, 2), in units in which the density is 1.
+
+    Raises:
+        ValueError: There are no agents, or the mean degree isn't positive.
+
+    Source: M. Penrose, Random Geometric Graphs, 2003.
+    """
+    if agents < 1 or not mean_degree > 0:
+        raise ValueError(f"expected at least one agent and a positive mean degree; got {agents} and {mean_degree}")
+    points = rng.uniform(0.0, np.sqrt(agents), (agents, 2))
+    graph = nx.Graph()
+    graph.add_nodes_from(range(agents))
+    radius2 = mean_degree / np.pi
+    rows = max(1, 2**22 // agents)  # 32 MiB of distances at a time
+    for first in range(0, agents, rows):
+        block = points[first : first + rows]
+        distance2 = _squared_distances(block, points[first:])
+        one, other = np.nonzero(distance2 < radius2)
+        later = other > one
+        graph.add_edges_from(zip((one[later] + first).tolist(), (other[later] + first).tolist(), strict=True))
+    graph.add_edges_from(_minimum_spanning_tree(points))
+    return graph, points
+
+
+def _minimum_spanning_tree(points: FloatArray) -> list[tuple[int, int]]:
+    """Edges of the Euclidean minimum spanning tree, by Prim's algorithm: O(N^2) time, O(N) memory."""
+    nearest2 = np.full(len(points), np.inf)  # squared distance to the tree; nan once inside it
+    parent = np.zeros(len(points), dtype=np.intp)
+    newest = 0
+    edges = []
+    for _ in range(len(points) - 1):
+        nearest2[newest] = np.nan
+        distance2 = _squared_distances(points[newest : newest + 1], points)[0]
+        closer = distance2 < nearest2
+        nearest2[closer] = distance2[closer]
+        parent[closer] = newest
+        newest = int(np.nanargmin(nearest2))
+        edges.append((int(parent[newest]), newest))
+    return edges
+
+
+def _squared_distances(a: FloatArray, b: FloatArray) -> FloatArray:
+    x = a[:, None, 0] - b[:, 0]
+    y = a[:, None, 1] - b[:, 1]
+    return np.asarray(x * x + y * y)
+
+
+def _distance(graph: nx.Graph, a: int, b: int) -> str:
+    return str(nx.shortest_path_length(graph, a, b)) if nx.has_path(graph, a, b) else "infinity (no path)"
+
+
+def _listed(items: Iterable[object]) -> str:
+    items = list(items)
+    shown = ", ".join(map(str, items[:_SHOWN]))
+    return f"{shown} and {len(items) - _SHOWN} more" if len(items) > _SHOWN else shown

@@ -1,0 +1,255 @@
+"""The library's agent models: frozen parameters, and the right-hand sides of a textbook or of the paper.
+
+Each docstring gives the equation and its source. To write another, subclass AgentModel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from khop_env.compiled import compiled
+from khop_env.elementary import sin, tanh
+from khop_env.physics.agent_model import AgentModel, FloatArray, InputLimit
+
+_BLOCK = 1024  # agents gathered at a time by the compiled drift: two such columns fit into the first-level cache
+
+
+@dataclass(frozen=True, eq=False)
+class SingleIntegrator(AgentModel):
+    """A point whose velocity is commanded: x' = u, in `dim` dimensions.
+
+    Source: the standard agent of consensus theory, e.g. M. Mesbahi and M. Egerstedt, Graph Theoretic Methods in
+    Multiagent Networks, 2010, chapter 3.
+    """
+
+    dim: int = 2
+    input_limit: InputLimit = 1.0  # m/s
+
+    type = "integrator"
+
+    def __post_init__(self) -> None:
+        if self.dim not in (1, 2, 3):
+            raise ValueError(f"SingleIntegrator.dim must be 1, 2 or 3; got {self.dim!r}")
+        super().__post_init__()
+
+    @property
+    def states(self) -> Mapping[str, str]:  # type: ignore[override]
+        """Coordinates, in m."""
+        return dict.fromkeys("xyz"[: self.dim], "m")
+
+    @property
+    def inputs(self) -> Mapping[str, str]:  # type: ignore[override]
+        """Velocities, in m/s."""
+        return {f"v{axis}": "m/s" for axis in self.states}
+
+    @property
+    def position(self) -> tuple[str, ...]:  # type: ignore[override]
+        """All coordinates."""
+        return tuple(self.states)
+
+    def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
+        """Drift f = 0."""
+        return np.zeros_like(x)
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+        """Input map g = u."""
+        return u
+
+    def drift_lipschitz(self) -> float:
+        """Zero: there is no drift."""
+        return 0.0
+
+
+@compiled
+def drifting_integrator_drift(x: FloatArray, out: FloatArray) -> None:
+    """Write the drift of DriftingIntegrator at x (B, rows, 2) into `out` of the same shape; both may be strided.
+
+    Columns are gathered into contiguous blocks first: a loop over a stride known only at run time doesn't vectorise.
+    """
+    batch, rows, _ = x.shape
+    step = max(1, _BLOCK // max(1, rows))
+    half_sum = np.empty(step * rows)
+    half_difference = np.empty(step * rows)
+    for first in range(0, batch, step):
+        count = min(step, batch - first)
+        for b in range(count):
+            for r in range(rows):
+                half_sum[b * rows + r] = 0.5 * x[first + b, r, 0] + 0.5 * x[first + b, r, 1]
+                half_difference[b * rows + r] = 0.5 * x[first + b, r, 0] - 0.5 * x[first + b, r, 1]
+        for i in range(count * rows):
+            half_sum[i] = tanh(half_sum[i])
+        for i in range(count * rows):
+            half_difference[i] = sin(half_difference[i])
+        for b in range(count):
+            for r in range(rows):
+                out[first + b, r, 0] = half_sum[b * rows + r]
+                out[first + b, r, 1] = half_difference[b * rows + r]
+
+
+@dataclass(frozen=True, eq=False)
+class DriftingIntegrator(AgentModel):
+    """The agent of the paper's simulation section: x' = f(x) + u.
+
+        f(x) = [tanh(x1 / 2 + x2 / 2), sin(x1 / 2 - x2 / 2)]
+
+    |f| is at most 1 in each component, so an input limit above 1 m/s can overcome it.
+    """
+
+    input_limit: InputLimit = 10.0  # m/s
+
+    type = "drifter"
+    states = MappingProxyType({"x1": "m", "x2": "m"})
+    inputs = MappingProxyType({"u1": "m/s", "u2": "m/s"})
+    position = ("x1", "x2")
+
+    def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
+        """The f of the paper's simulation section, compiled."""
+        stacked = x if x.ndim == 3 else x.reshape(1, -1, 2)
+        out = np.empty(stacked.shape)
+        drifting_integrator_drift(stacked, out)
+        return out.reshape(x.shape)
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+        """Input map g = u."""
+        return u
+
+    def drift_lipschitz(self) -> float:
+        """The paper's l_f = 1 (the smallest constant is 1 / sqrt(2))."""
+        return 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class DoubleIntegrator(AgentModel):
+    """A cart in the plane whose acceleration is commanded: p' = v, v' = -damping v + u; damping in 1/s.
+
+    Source: W. Ren and R. W. Beard, Distributed Consensus in Multi-vehicle Cooperative Control, 2008, chapter 4.
+    """
+
+    damping: float = 0.5
+    input_limit: InputLimit = 1.0  # m/s^2
+
+    type = "cart"
+    states = MappingProxyType({"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"})
+    inputs = MappingProxyType({"ax": "m/s^2", "ay": "m/s^2"})
+    position = ("x", "y")
+
+    def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
+        """Drift f = [v, -damping v]."""
+        velocity = x[..., 2:]
+        return np.concatenate([velocity, -self.damping * velocity], axis=-1)
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+        """Input map g = [0, u]."""
+        return np.concatenate([np.zeros_like(u), u], axis=-1)
+
+    def drift_lipschitz(self) -> float:
+        """The norm of [[0, 1], [0, -damping]]."""
+        return math.hypot(1.0, self.damping)
+
+
+@dataclass(frozen=True, eq=False)
+class Unicycle(AgentModel):
+    """A wheeled robot: x' = v cos(heading), y' = v sin(heading), heading' = omega; inputs v and omega.
+
+    g depends on the state and is bounded, the extension that the paper's remark after Assumption 2 allows for the
+    state observer. Headings are not wrapped. Source: K. M. Lynch and F. C. Park, Modern Robotics, 2017, section 13.3.
+    """
+
+    input_limit: InputLimit = (1.0, 2.0)  # m/s, rad/s
+
+    type = "unicycle"
+    states = MappingProxyType({"x": "m", "y": "m", "heading": "rad"})
+    inputs = MappingProxyType({"speed": "m/s", "turn_rate": "rad/s"})
+    position = ("x", "y")
+    input_map_uses_state = True
+
+    def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
+        """Drift f = 0."""
+        return np.zeros_like(x)
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+        """Input map g = [v cos(heading), v sin(heading), omega]."""
+        speed, heading = u[..., 0], x[..., 2]
+        return np.stack([speed * np.cos(heading), speed * np.sin(heading), u[..., 1]], axis=-1)
+
+    def input_map_bound(self) -> FloatArray:
+        """Exact over all headings: [v, v, omega] at their limits."""
+        return self.input_limit[[0, 0, 1]]
+
+    def drift_lipschitz(self) -> float:
+        """Zero: there is no drift."""
+        return 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceVessel(AgentModel):
+    """A ship in the plane with 3 degrees of freedom: pose eta = (x, y, heading), body velocity nu = (u, v, r).
+
+        eta' = R(heading) nu
+        M nu' + C(nu) nu + D(nu) nu = tau
+
+    M = diag(mass) includes the added mass, C(nu) nu = [-m2 v r, m1 u r, (m2 - m1) u v] does no work, and
+    D(nu) = diag(linear_drag + quadratic_drag |nu|). The inputs are tau: two forces and a moment, so the vessel is
+    fully actuated. The drift is only locally Lipschitz (Coriolis terms and quadratic drag), while the observers'
+    theorems need a constant: keep the states in a bounded operating region. Headings are not wrapped.
+
+    Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011, chapters 6 and 7. The default
+    values are those of the model ship CyberShip II, rounded (R. Skjetne, O. N. Smogeli and T. I. Fossen, Modeling,
+    Identification and Control 25(1), 2004), with three simplifications: no coupling of sway and yaw in M and D,
+    no cubic drag, and input limits of our choice.
+    """
+
+    mass: tuple[float, float, float] = (25.8, 33.8, 2.76)  # kg, kg, kg m^2
+    linear_drag: tuple[float, float, float] = (0.72, 0.86, 1.9)  # kg/s, kg/s, kg m^2/s
+    quadratic_drag: tuple[float, float, float] = (1.33, 36.3, 0.75)  # kg/m, kg/m, kg m^2
+    input_limit: InputLimit = (2.0, 1.5, 1.5)  # N, N, N m
+
+    type = "vessel"
+    states = MappingProxyType(
+        {"x": "m", "y": "m", "heading": "rad", "surge": "m/s", "sway": "m/s", "yaw_rate": "rad/s"}
+    )
+    inputs = MappingProxyType({"surge_force": "N", "sway_force": "N", "yaw_moment": "N m"})
+    position = ("x", "y")
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "linear_drag", "quadratic_drag"):
+            values = tuple(float(value) for value in getattr(self, name))
+            if len(values) != 3 or not all(value >= 0 for value in values) or (name == "mass" and 0 in values):
+                sign = "positive" if name == "mass" else "non-negative"
+                raise ValueError(f"SurfaceVessel.{name} must be three {sign} numbers (surge, sway, yaw); got {values}")
+            object.__setattr__(self, name, values)
+        super().__post_init__()
+
+    def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
+        """Drift f = [R(heading) nu, -M^-1 (C(nu) nu + D(nu) nu)]."""
+        heading, nu = x[..., 2], x[..., 3:]
+        u, v, r = nu[..., 0], nu[..., 1], nu[..., 2]
+        m1, m2, m3 = self.mass
+        drag = (np.array(self.linear_drag) + np.array(self.quadratic_drag) * np.abs(nu)) * nu
+        cos, sin = np.cos(heading), np.sin(heading)
+        rate = np.empty_like(x)
+        rate[..., 0] = cos * u - sin * v
+        rate[..., 1] = sin * u + cos * v
+        rate[..., 2] = r
+        rate[..., 3] = (m2 * v * r - drag[..., 0]) / m1
+        rate[..., 4] = (-m1 * u * r - drag[..., 1]) / m2
+        rate[..., 5] = ((m1 - m2) * u * v - drag[..., 2]) / m3
+        return rate
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+        """Input map g = [0, M^-1 tau]."""
+        return np.concatenate([np.zeros_like(u), u / np.array(self.mass)], axis=-1)
+
+    def drift_lipschitz(self) -> float:
+        """Infinite: the drift is quadratic in the velocities."""
+        return math.inf
+
+
+MODELS: dict[str, type[AgentModel]] = {
+    model.type: model for model in (SingleIntegrator, DriftingIntegrator, DoubleIntegrator, Unicycle, SurfaceVessel)
+}

@@ -1,0 +1,158 @@
+"""A named problem: agents, graphs, bounds, disturbances and a law, from which a simulator is built."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from numpy.typing import ArrayLike
+
+from khop_env.observers import Bound, ObserverDesign, PerformanceFunction, TargetObservers
+from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
+from khop_env.simulation import InitialSet, Integrator, Law, Observe, Proximal, Simulator
+
+Bounds = PerformanceFunction | Mapping[str, Bound]
+"""Bounds on estimation errors: one function for all agents, or one `Bound` per agent type."""
+
+
+@dataclass(frozen=True)
+class LawChoice:
+    """The name of a feedback law and its parameters; `agents.make_law` turns it into the law."""
+
+    name: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scenario:
+    """One problem, complete: what a simulator or an environment is built from.
+
+    Attributes:
+        name: what it is called.
+        description: one line.
+        models: one agent model per agent; neighbours with equal models are evaluated together.
+        communication: who hears whom; nodes 0..N-1, connected.
+        task: who should agree with whom, on the same nodes, within k hops.
+        k: agents up to k hops away are estimated.
+        relay: whether agents relay their neighbours' states (the paper's Assumption 4).
+        delta: bounds on the state estimation errors.
+        theta: bounds on the input estimation errors, where there are input observers.
+        observers: per agent, which simplification its observers use; None for the default of `ObserverDesign`.
+        disturbance: w_i(x, t), or None.
+        center: (n,) centre of the box that states start in, and the observers' first guess.
+        radius: (n,) its half widths.
+        law: the feedback law it is meant to run with.
+        duration: length of an experiment in s.
+        dt: step of the proximal integrator in s.
+        order: its order.
+
+    Raises:
+        ValueError: if graphs, sets and agents don't fit together; the message says which.
+    """
+
+    name: str
+    description: str
+    models: tuple[AgentModel, ...]
+    communication: nx.Graph
+    task: nx.Graph
+    k: int
+    delta: Bounds
+    theta: Bounds | None = None
+    relay: bool = True
+    observers: tuple[TargetObservers, ...] | None = None
+    disturbance: Disturbance | None = None
+    center: ArrayLike = 0.0
+    radius: ArrayLike = 1.0
+    law: LawChoice = LawChoice("tanh")
+    duration: float = 10.0
+    dt: float = 0.01
+    order: int = 2
+
+    def __post_init__(self) -> None:
+        agents = len(self.models)
+        validate_graph(self.communication, agents)
+        check_task_graph(validate_graph(self.task, agents, name="task graph", connected=False), self.communication, self.k)
+        for name in ("center", "radius"):
+            values = np.asarray(getattr(self, name), dtype=float)
+            if values.shape not in ((), (self.fleet.n,)) or not np.all(np.isfinite(values)):
+                raise ValueError(
+                    f"scenario {self.name!r}: {name} must be one finite number or {self.fleet.n}, one per state "
+                    f"component of the fleet; got shape {values.shape}"
+                )
+            object.__setattr__(self, name, np.broadcast_to(values, (self.fleet.n,)).copy())
+        if np.any(np.asarray(self.radius) < 0.0):
+            raise ValueError(f"scenario {self.name!r}: radius must not be negative")
+        for name in ("duration", "dt"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"scenario {self.name!r}: {name} must be positive; got {getattr(self, name)!r}")
+
+    def replace(self, **changes: Any) -> Scenario:
+        """A copy with some attributes changed."""
+        return replace(self, **changes)
+
+    @cached_property
+    def fleet(self) -> Fleet:
+        """The agents, numbered."""
+        return Fleet(self.models)
+
+    @cached_property
+    def initial(self) -> InitialSet:
+        """Where states start."""
+        return InitialSet(np.asarray(self.center), np.asarray(self.radius))
+
+    @cached_property
+    def design(self) -> ObserverDesign:
+        """The observers: k-hop sets, matrices and funnels.
+
+        Raises:
+            DesignError: if they can't be designed as asked.
+        """
+        return ObserverDesign(
+            self.fleet,
+            self.communication,
+            self.k,
+            self._per_agent(self.delta, "delta"),
+            None if self.theta is None else self._per_agent(self.theta, "theta"),
+            self.relay,
+            self.observers,
+        )
+
+    def build(
+        self,
+        *,
+        law: Law | None = None,
+        observe: Observe = "estimate",
+        integrator: Integrator | None = None,
+        batch: int = 1,
+    ) -> Simulator:
+        """A simulator of `batch` copies.
+
+        Args:
+            law: feedback law, e.g. `agents.make_law(scenario.law)`; None to give inputs to `Simulator.step`.
+            observe: what the law sees of agents out of earshot.
+            integrator: the proximal one of `order` by default.
+            batch: number of copies B.
+        """
+        return Simulator(
+            self.design,
+            self.initial,
+            disturbance=self.disturbance,
+            law=law,
+            task=self.task,
+            observe=observe,
+            integrator=integrator or Proximal(self.order),
+            batch=batch,
+        )
+
+    def _per_agent(self, bounds: Bounds, name: str) -> PerformanceFunction | dict[int, Bound]:
+        if not isinstance(bounds, Mapping):
+            return bounds
+        types = {model.type for model in self.models}
+        for key in bounds:
+            if key not in types:
+                raise ValueError(f"scenario {self.name!r}: {name} is given for {key!r}; {did_you_mean(key, types)}")
+        return {i: bounds[model.type] for i, model in enumerate(self.models) if model.type in bounds}

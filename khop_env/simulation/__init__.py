@@ -1,0 +1,22 @@
+"""THE CLOCK: world and belief advance together. Everything with dt in it is here."""
+
+from khop_env.simulation.integrators import Explicit, FunnelError, Integrator, Proximal, SolveError
+from khop_env.simulation.simulator import Extremes, InitialSet, Simulator
+from khop_env.simulation.state import SimulatorState
+from khop_env.simulation.view import OBSERVE, Law, Observe, View
+
+__all__ = [
+    "OBSERVE",
+    "Explicit",
+    "Extremes",
+    "FunnelError",
+    "InitialSet",
+    "Integrator",
+    "Law",
+    "Observe",
+    "Proximal",
+    "Simulator",
+    "SimulatorState",
+    "SolveError",
+    "View",
+]

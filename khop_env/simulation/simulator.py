@@ -1,0 +1,270 @@
+"""The simulator: B copies of one closed loop, their seeds, and their state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from numpy.typing import ArrayLike
+
+from khop_env.observers import FloatArray, Funnels, ObserverDesign
+from khop_env.observers.disagreement import disagreement, extremes
+from khop_env.simulation.closed_loop import ClosedLoop
+from khop_env.simulation.integrators import Integrator, Proximal
+from khop_env.simulation.state import SimulatorState
+from khop_env.simulation.view import Law, Observe
+
+
+@dataclass(frozen=True, eq=False)
+class InitialSet:
+    """Where states start: uniformly in a box. Its centre is the observers' common first guess.
+
+    Attributes:
+        center: (n,) in the states' units.
+        radius: (n,) half widths, not negative.
+    """
+
+    center: FloatArray
+    radius: FloatArray
+
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """One (n,) initial state."""
+        return self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """The largest ratios since reset, one per environment: below 1 the guarantee holds.
+
+    Attributes:
+        normalized: (B,) largest |xi| / rho over pairs, components and steps.
+        relative: (B,) largest |x_tilde| / delta.
+        input_normalized: (B,) largest |mu| / omega.
+        input_relative: (B,) largest |g_tilde| / theta.
+    """
+
+    normalized: FloatArray
+    relative: FloatArray
+    input_normalized: FloatArray
+    input_relative: FloatArray
+
+
+class Simulator:
+    """B copies of a fleet, its disturbances and its observers, advanced together.
+
+    Args:
+        design: fleet, communication graph and observers.
+        initial: where states start.
+        disturbance: a `physics.Disturbance`, or None.
+        law: feedback law evaluated at every stage (continuous-time closed loop); None to hold the inputs given to
+            `step` (sampled control).
+        task: task graph; needed with a law.
+        observe: what the law sees of agents out of earshot: "estimate", "oracle" or "local".
+        integrator: `Proximal(order=2)` by default.
+        batch: number of environments B.
+
+    Raises:
+        DesignError: if the initial set doesn't fit into the funnels.
+        ValueError: for a law without a task graph, or an unknown `observe`.
+    """
+
+    def __init__(
+        self,
+        design: ObserverDesign,
+        initial: InitialSet,
+        *,
+        disturbance: Any | None = None,
+        law: Law | None = None,
+        task: nx.Graph | None = None,
+        observe: Observe = "estimate",
+        integrator: Integrator | None = None,
+        batch: int = 1,
+    ) -> None:
+        if law is not None and task is None:
+            raise ValueError("a law acts along the edges of a task graph; give task=")
+        if batch < 1:
+            raise ValueError(f"batch must be at least 1; got {batch!r}")
+        self.design, self.fleet, self.initial, self.batch = design, design.fleet, initial, batch
+        design.require_feasible_start(initial.radius, self.fleet.input_map_bound)
+        self.integrator: Integrator = integrator or Proximal()
+        attached = None if disturbance is None else disturbance.attach(self.fleet)
+        self._loop = ClosedLoop(design, attached, law, task, observe, batch)
+        draws = 0 if attached is None else attached.draws
+        sizes = design.states.layout.size, design.inputs.layout.size
+        self._state = SimulatorState.zeros(batch, self.fleet.n, self.fleet.m, *sizes, draws)
+        self.integrator.prepare(self._loop)
+        self._extremes = np.zeros((4, batch))
+        self._scratch = [
+            (np.zeros((f.layout.size, batch)), np.ones((f.layout.rows, batch)), np.ones((f.layout.rows, batch)))
+            for f in (design.states, design.inputs)
+        ]
+        self.reset(seed=0)
+
+    # -- reading -------------------------------------------------------------------------------------------------
+
+    @property
+    def t(self) -> FloatArray:
+        """(B,) time since reset in s."""
+        return self._state.t
+
+    @property
+    def x(self) -> FloatArray:
+        """(B, n) true states; `fleet.state_slice(i)` is agent i's part."""
+        return self._state.x.T
+
+    @property
+    def u(self) -> FloatArray:
+        """(B, m) inputs in force."""
+        return self._state.u.T
+
+    @property
+    def g(self) -> FloatArray:
+        """(B, n) their effect g_i(x_i, u_i) on the states."""
+        return self._state.g.T
+
+    @property
+    def estimates(self) -> FloatArray:
+        """(B, P) state estimates in the order of `design.states.layout`."""
+        return self._state.estimate.T
+
+    @property
+    def input_estimates(self) -> FloatArray:
+        """(B, Q) estimates of g in the order of `design.inputs.layout`."""
+        return self._state.input_estimate.T
+
+    @property
+    def extremes(self) -> Extremes:
+        """The largest ratios at any grid point since the last reset."""
+        return Extremes(*self._extremes.copy())
+
+    def errors(self) -> FloatArray:
+        """(B, P) estimation errors x_tilde."""
+        return self.estimates - self.x[:, self.design.states.layout.column_source]
+
+    def disagreements(self) -> FloatArray:
+        """(B, P) disagreements xi."""
+        return self._disagreement(self.design.states, self._state.estimate, self._state.x).T
+
+    def input_errors(self) -> FloatArray:
+        """(B, Q) estimation errors of g."""
+        return self.input_estimates - self.g[:, self.design.inputs.layout.column_source]
+
+    def input_disagreements(self) -> FloatArray:
+        """(B, Q) input disagreements mu."""
+        return self._disagreement(self.design.inputs, self._state.input_estimate, self._state.g).T
+
+    # -- writing -------------------------------------------------------------------------------------------------
+
+    def reset(
+        self, seed: int | Sequence[int | np.random.Generator] = 0, x0: ArrayLike | None = None
+    ) -> Simulator:
+        """Start a new episode in every environment.
+
+        Args:
+            seed: environment b draws its initial state and disturbance from seed + b, or from seed[b].
+            x0: (n,) or (B, n) initial states instead of drawn ones.
+
+        Raises:
+            ValueError: for x0 of a wrong shape or not finite, or not B seeds.
+            DesignError: for an x0 that the observers can't start from.
+        """
+        seeds = [seed + b for b in range(self.batch)] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != self.batch:
+            raise ValueError(f"expected one seed or {self.batch}, one per environment; got {len(seeds)}")
+        state, loop = self._state, self._loop
+        for b, one in enumerate(seeds):
+            rng = np.random.default_rng(one)
+            state.x[:, b] = self.initial.draw(rng)
+            if loop.disturbance is not None:
+                state.drawn[b] = loop.disturbance.draw(rng)
+        if x0 is not None:
+            given = np.asarray(x0, dtype=float)
+            if given.shape not in ((self.fleet.n,), (self.batch, self.fleet.n)) or not np.all(np.isfinite(given)):
+                raise ValueError(
+                    f"x0 must be finite, of shape ({self.fleet.n},) or ({self.batch}, {self.fleet.n}); got shape "
+                    f"{given.shape}"
+                )
+            away = np.abs(given - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
+            self.design.require_feasible_start(away, np.zeros(self.fleet.n))
+            state.x[...] = np.broadcast_to(given, (self.batch, self.fleet.n)).T
+        state.t[...] = 0.0
+        state.u[...] = 0.0
+        state.estimate[...] = self.initial.center[self.design.states.layout.column_source][:, None]
+        state.input_estimate[...] = 0.0
+        state.eps[...] = 0.0
+        state.nu[...] = 0.0
+        self.integrator.start(state)
+        self._extremes[...] = 0.0
+        self._watch()
+        return self
+
+    def step(self, dt: float, u: ArrayLike | None = None) -> None:
+        """Advance every environment by `dt` seconds.
+
+        Args:
+            dt: step in s, positive.
+            u: (m,) or (B, m) inputs held over the step, where the simulator has no law; the last ones if left out.
+
+        Raises:
+            ValueError: for a step that isn't positive, or inputs given to a simulator with a law, misshapen or not
+                finite; the state is unchanged.
+            FunnelError: if an explicit step leaves the funnel; the state is the last one inside.
+            SolveError: if a right-hand side gives numbers that aren't finite.
+        """
+        if not dt > 0.0 or not np.isfinite(dt):
+            raise ValueError(f"dt must be positive and finite; got {dt!r}")
+        if u is not None:
+            self._hold(u)
+        self.integrator.step(self._state, float(dt))
+        self._watch()
+
+    def save(self) -> SimulatorState:
+        """Everything needed to continue bit for bit."""
+        return self._state.copy()
+
+    def restore(self, saved: SimulatorState) -> None:
+        """Continue from a saved state; `extremes` start anew.
+
+        Raises:
+            ValueError: if it was saved by a simulator of other dimensions.
+        """
+        self._state.assign(saved)
+        self._extremes[...] = 0.0
+        self._watch()
+
+    def _hold(self, u: ArrayLike) -> None:
+        if self._loop.law is not None:
+            raise ValueError("this simulator has a law, which computes the inputs; build it with law=None to give u")
+        given = np.asarray(u, dtype=float)
+        if given.shape not in ((self.fleet.m,), (self.batch, self.fleet.m)):
+            raise ValueError(f"u must have shape ({self.fleet.m},) or {(self.batch, self.fleet.m)}; got {given.shape}")
+        bad = np.flatnonzero(~np.isfinite(given.reshape(-1, self.fleet.m)).all(axis=0))
+        if bad.size:
+            agent, name, unit = self.fleet.input_names()[bad[0]]
+            raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
+        self._state.u[...] = np.broadcast_to(given, (self.batch, self.fleet.m)).T
+        self.integrator.start(self._state)
+
+    def _disagreement(self, funnels: Funnels, estimate: FloatArray, source: FloatArray) -> FloatArray:
+        out = np.zeros((funnels.layout.size, self.batch))
+        disagreement(*funnels.layout.arrays, estimate, source, out)
+        return out
+
+    def _watch(self) -> None:
+        """Raise the running extremes to those of the present state."""
+        state = self._state
+        for index, funnels, estimate, source in (
+            (0, self.design.states, state.estimate, state.x),
+            (2, self.design.inputs, state.input_estimate, state.g),
+        ):
+            if not funnels.layout.size:
+                continue
+            xi, rho, delta = self._scratch[index // 2]
+            disagreement(*funnels.layout.arrays, estimate, source, xi)
+            funnels.rho.evaluate(state.t, rho)
+            funnels.delta.evaluate(state.t, delta)
+            normalized, relative = self._extremes[index], self._extremes[index + 1]
+            extremes(funnels.layout.plan, xi, rho, delta, estimate, source, normalized, relative)

@@ -1,0 +1,118 @@
+"""What a feedback law gets to see: the states it may know, read through the task graph's edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import networkx as nx
+import numpy as np
+
+from khop_env.compiled import compiled
+from khop_env.observers import FloatArray, IntArray, ObserverDesign
+from khop_env.physics import Fleet
+
+Observe = Literal["estimate", "oracle", "local"]
+OBSERVE: tuple[Observe, ...] = ("estimate", "oracle", "local")
+
+
+@dataclass(slots=True)
+class View:
+    """What the agents know at one instant, in a form that a law can use for all of them at once.
+
+    Attributes:
+        fleet: the agents' models and offsets.
+        x: (B, n) states; agent i's law may read its own slice only.
+        edges: (E, 2) directed task edges: agent i = edges[:, 0] is to act on agent j = edges[:, 1].
+        known: (E,) whether i knows anything of j's state: it hears j, or observes it.
+        displacement: (B, E, d) position of j, as i hears or estimates it, minus i's own, in m; 0 where not known.
+
+    The arrays are overwritten by the next evaluation; a law that keeps one copies it.
+    """
+
+    fleet: Fleet
+    x: FloatArray
+    edges: IntArray
+    known: np.ndarray
+    displacement: FloatArray
+
+
+class Law(Protocol):
+    """A feedback law: a pure function of time and of what the agents know."""
+
+    def __call__(self, t: FloatArray, view: View) -> FloatArray:
+        """Inputs (B, m) of the whole fleet at the times `t` (B,), within the input limits."""
+        ...
+
+
+class ViewBuilder:
+    """Fills a `View` from the simulator's states and estimates.
+
+    Args:
+        design: the observers, which say who estimates whom.
+        task: the task graph on the same nodes.
+        observe: what stands for agents out of earshot: their "estimate", the truth ("oracle"), or nothing ("local").
+        batch: number of environments.
+
+    Raises:
+        ValueError: for an unknown `observe`.
+    """
+
+    def __init__(self, design: ObserverDesign, task: nx.Graph, observe: Observe, batch: int) -> None:
+        if observe not in OBSERVE:
+            raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {observe!r}")
+        fleet = design.fleet
+        edges = np.array(sorted([*task.edges, *((j, i) for i, j in task.edges)]), np.int64).reshape(-1, 2)
+        position, offset = fleet.position_index, fleet.state_offset
+        self._own = np.ascontiguousarray(position[edges[:, 0]])
+        self._other = np.ascontiguousarray(position[edges[:, 1]])
+        self._kind = np.zeros(len(edges), np.int64)
+        for number, (i, j) in enumerate(edges.tolist()):
+            if design.communication.has_edge(i, j) or observe == "oracle":
+                continue
+            if observe == "estimate":
+                self._kind[number] = 1
+                self._other[number] += design.states.layout.slot[i, j] - offset[j]
+            else:
+                self._kind[number] = 2
+        self._columns = np.zeros((len(edges), fleet.position_dim, batch))
+        self.view = View(
+            fleet=fleet,
+            x=np.zeros((batch, fleet.n)),
+            edges=edges,
+            known=self._kind < 2,
+            displacement=self._columns.transpose(2, 0, 1),
+        )
+
+    def update(self, x: FloatArray, estimate: FloatArray) -> View:
+        """The view at states `x` (n, B) and estimates (P, B)."""
+        _displacements(self._kind, self._own, self._other, x, estimate, self._columns)
+        self.view.x = x.T
+        return self.view
+
+
+@compiled
+def _displacements(
+    kind: IntArray, own: IntArray, other: IntArray, x: FloatArray, estimate: FloatArray, out: FloatArray
+) -> None:
+    for edge in range(kind.size):
+        if kind[edge] == 2:
+            continue
+        for c in range(own.shape[1]):
+            mine, theirs = own[edge, c], other[edge, c]
+            if kind[edge] == 1:
+                for env in range(x.shape[1]):
+                    out[edge, c, env] = estimate[theirs, env] - x[mine, env]
+            else:
+                for env in range(x.shape[1]):
+                    out[edge, c, env] = x[theirs, env] - x[mine, env]
+
+
+def sum_over_edges(agents: int, edges: IntArray, terms: FloatArray) -> FloatArray:
+    """(B, N, d) sums of edge terms (B, E, d) over each agent's own task edges; for laws written in plain NumPy."""
+    total = np.zeros((terms.shape[0], agents, terms.shape[2]))
+    np.add.at(total, (slice(None), edges[:, 0]), terms)
+    return total
+
+
