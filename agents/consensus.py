@@ -41,7 +41,7 @@ class TanhConsensus:
         if view is not self._view:
             self._prepare(view)
         fleet, batch = view.fleet, len(view.x)
-        _sum_tanh(self.gain, view.edges, view.displacement, self._velocity)
+        sum_tanh(self.gain, view.edges, view.displacement.transpose(1, 2, 0), self._velocity)
         velocity = self._velocity.transpose(2, 0, 1)
         if self._direct:
             return velocity.reshape(batch, -1)
@@ -65,11 +65,21 @@ class TanhConsensus:
 
 
 @compiled
-def _sum_tanh(gain: float, edges: IntArray, displacement: FloatArray, out: FloatArray) -> None:
-    """Out (N, d, B) from displacements (B, E, d), which are 0 for edges that i knows nothing about."""
+def sum_tanh(gain: float, edges: IntArray, displacement: FloatArray, out: FloatArray) -> None:
+    """Write the law's velocities (N, d, B) from displacements (E, d, B), which are 0 where an agent knows nothing."""
     out[:] = 0.0
+    dim, batch = displacement.shape[1], displacement.shape[2]
+    if batch > 1:
+        for edge in range(edges.shape[0]):
+            agent = edges[edge, 0]
+            for c in range(dim):
+                for env in range(batch):
+                    out[agent, c, env] += gain * tanh(displacement[edge, c, env])
+        return
+    terms = np.empty(displacement.size)  # one environment: vectorise along the edges instead
+    flat = displacement.reshape(-1)
+    for q in range(flat.size):
+        terms[q] = gain * tanh(flat[q])
     for edge in range(edges.shape[0]):
-        agent = edges[edge, 0]
-        for c in range(out.shape[1]):
-            for env in range(out.shape[2]):
-                out[agent, c, env] += gain * tanh(displacement[env, edge, c])
+        for c in range(dim):
+            out[edges[edge, 0], c, 0] += terms[edge * dim + c]

@@ -8,6 +8,7 @@ The norm of the funnels of one target may be at most lambda_min(M_i) times the s
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -173,6 +174,22 @@ class ObserverDesign:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def with_bounds(
+        self,
+        delta: PerformanceFunction | Mapping[int, Bound],
+        theta: PerformanceFunction | Mapping[int, Bound] | None = None,
+    ) -> ObserverDesign:
+        """The same observers with other bounds: graphs, layouts and spectra are shared, not computed again."""
+        other = copy.copy(self)
+        for name, value in (
+            ("delta", delta),
+            ("theta", theta),
+            ("states", Funnels(self.states.layout, self._rows(self.states.layout, delta, "delta"))),
+            ("inputs", Funnels(self.inputs.layout, self._rows(self.inputs.layout, theta, "theta"))),
+        ):
+            object.__setattr__(other, name, value)
+        return other
 
     def _rows(
         self, layout: PairLayout, bounds: PerformanceFunction | Mapping[int, Bound] | None, name: str

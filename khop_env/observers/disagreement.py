@@ -87,17 +87,17 @@ def correction(plan: IntArray, xi: FloatArray, rho: FloatArray, e: FloatArray, o
     """
     for t in range(plan.shape[0]):
         eta, n, offset, row = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 4]
-        for column in range(eta * n):
+        for c in range(n):
             for env in range(xi.shape[1]):
-                e[offset + column, env] = xi[offset + column, env] / rho[row + column % n, env]
-    flat, flat_out = e.ravel(), out.ravel()
-    for q in range(flat.size):
-        flat_out[q] = -transformation_slope(flat[q]) * transformation(flat[q])
-    for t in range(plan.shape[0]):
-        eta, n, offset, row = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 4]
-        for column in range(eta * n):
-            for env in range(xi.shape[1]):
-                out[offset + column, env] /= rho[row + column % n, env]
+                scale = 1.0 / rho[row + c, env]
+                for a in range(eta):
+                    out[offset + a * n + c, env] = scale
+    flat_xi, flat_e, flat_out = xi.reshape(-1), e.reshape(-1), out.reshape(-1)
+    for q in range(flat_xi.size):
+        scale = flat_out[q]
+        normalized = flat_xi[q] * scale
+        flat_e[q] = normalized
+        flat_out[q] = -transformation_slope(normalized) * transformation(normalized) * scale
 
 
 @compiled
@@ -116,25 +116,49 @@ def largest_curvature(plan: IntArray, e: FloatArray, rho: FloatArray, out: Float
 @compiled
 def extremes(
     plan: IntArray,
-    xi: FloatArray,
-    rho: FloatArray,
-    delta: FloatArray,
+    diagonal: FloatArray,
+    relay: FloatArray,
+    link_start: IntArray,
+    link: IntArray,
     estimate: FloatArray,
     source: FloatArray,
-    normalized: FloatArray,
-    relative: FloatArray,
+    rho: FloatArray,
+    gain: FloatArray,
+    out: FloatArray,
 ) -> None:
-    """Raise (B,) `normalized` to the largest |xi| / rho and (B,) `relative` to the largest |x_tilde| / delta."""
+    """Raise `out` (2, B) to the largest |xi| / rho and |x_tilde| / delta over all pairs and components.
+
+    Args:
+        plan: and `diagonal`, `relay`, `link_start`, `link`: `PairLayout.arrays`.
+        diagonal: see there.
+        relay: see there.
+        link_start: see there.
+        link: see there.
+        estimate: (P, B) estimates.
+        source: (n, B) the truth.
+        rho: (rows, B) funnels.
+        gain: (rows,) the design rule's rho / delta.
+        out: running maxima; inf where a number isn't finite.
+    """
+    batch = estimate.shape[1]
+    xi = np.empty(batch)
     for t in range(plan.shape[0]):
-        eta, n, offset, origin, row = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 4]
-        for column in range(eta * n):
-            c = column % n
-            for env in range(xi.shape[1]):
-                normalized[env] = max(normalized[env], abs(xi[offset + column, env]) / rho[row + c, env])
-                error = abs(estimate[offset + column, env] - source[origin + c, env])
-                relative[env] = max(relative[env], error / delta[row + c, env])
-    # max drops a NaN where it is the second argument; a trajectory that has one must not look fine
-    for env in range(xi.shape[1]):
-        for column in range(xi.shape[0]):
-            if not np.isfinite(xi[column, env]):
-                normalized[env] = np.inf
+        eta, n, offset, origin, row, pair = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 4], plan[t, 5]
+        for a in range(eta):
+            d, h = diagonal[pair + a], relay[pair + a]
+            for c in range(n):
+                column = offset + a * n + c
+                for env in range(batch):
+                    xi[env] = d * estimate[column, env] - h * source[origin + c, env]
+                for k in range(link_start[pair + a], link_start[pair + a + 1]):
+                    other = offset + link[k] * n + c
+                    for env in range(batch):
+                        xi[env] -= estimate[other, env]
+                factor = gain[row + c]
+                for env in range(batch):
+                    scale = 1.0 / rho[row + c, env]
+                    normalized = abs(xi[env]) * scale
+                    relative = abs(estimate[column, env] - source[origin + c, env]) * scale * factor
+                    normalized = normalized if normalized < np.inf else np.inf  # a NaN must not look fine
+                    out[0, env] = max(out[0, env], normalized)
+                    out[1, env] = max(out[1, env], relative)

@@ -104,14 +104,19 @@ class FunnelBank:
 
     Args:
         functions: one per row.
+
+    Attributes:
+        coefficients: rho(0) - rho(infinity), rho(infinity) and decay rate of each exponential row, (rows,) each.
     """
 
     def __init__(self, functions: Sequence[PerformanceFunction]) -> None:
         self.functions = tuple(functions)
         exponential = [f if isinstance(f, Exponential) else Exponential(1.0, 1.0, 1.0) for f in self.functions]
-        self._decaying = np.array([f.initial - f.final for f in exponential], dtype=float)
-        self._final = np.array([f.final for f in exponential], dtype=float)
-        self._rate = np.array([f.rate for f in exponential], dtype=float)
+        self.coefficients = (
+            np.array([f.initial - f.final for f in exponential], dtype=float),
+            np.array([f.final for f in exponential], dtype=float),
+            np.array([f.rate for f in exponential], dtype=float),
+        )
         self._others = [(r, f) for r, f in enumerate(self.functions) if not isinstance(f, Exponential)]
 
     def __len__(self) -> int:
@@ -123,7 +128,7 @@ class FunnelBank:
         Raises:
             ValueError: if a function that isn't an `Exponential` gives values that are not positive and finite.
         """
-        _exponentials(t, self._decaying, self._final, self._rate, out)
+        exponentials(t, *self.coefficients, out)
         for row, function in self._others:
             out[row] = function(t)
             if not np.all((out[row] > 0.0) & np.isfinite(out[row])):
@@ -139,7 +144,14 @@ class FunnelBank:
 
 
 @compiled
-def _exponentials(t: FloatArray, decaying: FloatArray, final: FloatArray, rate: FloatArray, out: FloatArray) -> None:
+def exponentials(t: FloatArray, decaying: FloatArray, final: FloatArray, rate: FloatArray, out: FloatArray) -> None:
+    """Write decaying exp(-rate t) + final into `out` (rows, B) at the times `t` (B,)."""
+    decay = np.empty(t.size)
     for row in range(rate.size):
+        if row == 0 or rate[row] != rate[row - 1]:  # one rate for all is the usual case
+            speed = rate[row]
+            for env in range(t.size):
+                decay[env] = expm1(-min(speed * t[env], 700.0)) + 1.0
+        start, floor = decaying[row], final[row]
         for env in range(t.size):
-            out[row, env] = decaying[row] * (expm1(-min(rate[row] * t[env], 700.0)) + 1.0) + final[row]
+            out[row, env] = start * decay[env] + floor

@@ -44,8 +44,8 @@ class AgentModel:
         states: Name of each of the n states and its unit, in order.
         inputs: Name of each of the m inputs and its unit, in order.
         position: Names of the states that are the agent's position.
-        input_limit: Symmetric bound |u| <= input_limit, a number or one per input, np.inf for unbounded; read it as
-            an array of shape (m,).
+        input_limit: Symmetric bound |u| <= input_limit, a number or one per input, np.inf for unbounded; reads as
+            an array of shape (m,) once the model is built.
         input_map_uses_state: Whether g depends on x. If so there is no input observer for it (the paper's Remark 1).
     """
 

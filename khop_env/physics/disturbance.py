@@ -1,4 +1,4 @@
-"""Bounded disturbances w_i(x, t): the paper's Assumption 1-iii, continuous and uniformly bounded, and how one is put together.
+"""Bounded disturbances w_i(x, t): continuous and uniformly bounded, as the paper's Assumption 1-iii asks.
 
 A disturbance is a frozen description, added to others with `+`, and attached to a fleet when a simulator is built.
 All its randomness is a vector of numbers drawn once per episode; given that vector, w is a pure function of t and x.

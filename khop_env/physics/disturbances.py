@@ -1,6 +1,6 @@
 """The library's disturbances: sines, noise in a band, gusts, and a coupling to the whole fleet.
 
-Every declared bound is exact: the least upper bound of |w| over time, states and draws.
+Every declared bound is the least upper bound of |w| over time, states and draws (to rounding).
 """
 
 from __future__ import annotations

@@ -6,9 +6,11 @@ n_i and m_i; offsets say where each begins, and neighbours of one model are eval
 
 from __future__ import annotations
 
+import operator
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did
 class Group:
     """A maximal run of consecutive agents with equal models.
 
-    Their states are the view `x[:, group.state_slice].reshape(B, group.size, group.model.n)`.
+    Their states are the view `x[:, group.state_slice].reshape(B, *group.state_shape)`.
 
     Attributes:
         model: Their common model.
@@ -27,6 +29,8 @@ class Group:
         stop: One past the index of the last.
         state_slice: Their part of the fleet's flat state.
         input_slice: Their part of the fleet's flat input.
+        state_shape: (agents, n_i).
+        input_shape: (agents, m_i).
     """
 
     model: AgentModel
@@ -34,6 +38,8 @@ class Group:
     stop: int
     state_slice: slice
     input_slice: slice
+    state_shape: tuple[int, int]
+    input_shape: tuple[int, int]
 
     @property
     def size(self) -> int:
@@ -108,7 +114,7 @@ class Fleet:
         """Agent's part of the flat input."""
         return slice(int(self.input_offset[agent]), int(self.input_offset[agent + 1]))
 
-    def agent(self, which: str | int) -> int:
+    def agent(self, which: str | SupportsIndex) -> int:
         """Index of an agent, given its id or its index.
 
         Raises:
@@ -118,9 +124,10 @@ class Fleet:
             if which not in self._index:
                 raise ValueError(f"no agent {which!r}; {did_you_mean(which, self.ids)}")
             return self._index[which]
-        if not 0 <= which < len(self):
-            raise ValueError(f"no agent {which}: the fleet's agents are 0 to {len(self) - 1}")
-        return int(which)
+        index = operator.index(which)
+        if not 0 <= index < len(self):
+            raise ValueError(f"no agent {index}: the fleet's agents are 0 to {len(self) - 1}")
+        return index
 
     def component_names(self) -> list[tuple[str, str, str]]:
         """(agent id, state name, unit) of each component of the flat state."""
@@ -147,7 +154,7 @@ class Fleet:
         out = np.empty(x.shape) if out is None else out
         t = t[:, None]
         for group in self.groups:
-            states = self._of_group(x, group)
+            states = x[:, group.state_slice].reshape(len(x), *group.state_shape)
             _fill(out, group, group.model.drift(t, states), states.shape, "drift(t, x)")
         return out
 
@@ -169,8 +176,8 @@ class Fleet:
         out = np.empty(x.shape) if out is None else out
         t = t[:, None]
         for group in self.groups:
-            states = self._of_group(x, group)
-            inputs = u[:, group.input_slice].reshape(len(u), group.stop - group.start, -1)
+            states = x[:, group.state_slice].reshape(len(x), *group.state_shape)
+            inputs = u[:, group.input_slice].reshape(len(u), *group.input_shape)
             _fill(out, group, group.model.input_map(t, states, inputs), states.shape, "input_map(t, x, u)")
         return out
 
@@ -178,19 +185,14 @@ class Fleet:
         """Positions of all agents, shape (B, N, d), from fleet states (B, n)."""
         return np.take(x, self.position_index, axis=-1)
 
-    @staticmethod
-    def _of_group(x: FloatArray, group: Group) -> FloatArray:
-        return x[:, group.state_slice].reshape(
-            len(x), group.stop - group.start, -1
-        )  # a view: only the last axis splits
-
     def _runs(self) -> tuple[Group, ...]:
         firsts = [0, *(i for i in range(1, len(self)) if self.models[i] != self.models[i - 1])]
         groups = []
         for start, stop in zip(firsts, [*firsts[1:], len(self)], strict=True):
             states = slice(int(self.state_offset[start]), int(self.state_offset[stop]))
             inputs = slice(int(self.input_offset[start]), int(self.input_offset[stop]))
-            groups.append(Group(self.models[start], start, stop, states, inputs))
+            model, size = self.models[start], stop - start
+            groups.append(Group(model, start, stop, states, inputs, (size, model.n), (size, model.m)))
         return tuple(groups)
 
 
@@ -201,7 +203,7 @@ def _fill(out: FloatArray, group: Group, value: FloatArray, shape: tuple[int, ..
             f"{group.model.__class__.__name__}.{what} returned shape {np.shape(value)}, expected {shape}: the leading "
             f"axes of x, then the {group.model.n} states {tuple(group.model.states)}"
         )
-    out[:, group.state_slice] = value.reshape(shape[0], -1)
+    out[:, group.state_slice].reshape(shape)[...] = value
 
 
 def _offsets(sizes: list[int]) -> IndexArray:

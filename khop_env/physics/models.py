@@ -16,8 +16,6 @@ from khop_env.compiled import compiled
 from khop_env.elementary import sin, tanh
 from khop_env.physics.agent_model import AgentModel, FloatArray, InputLimit
 
-_BLOCK = 1024  # agents gathered at a time by the compiled drift: two such columns fit into the first-level cache
-
 
 @dataclass(frozen=True, eq=False)
 class SingleIntegrator(AgentModel):
@@ -67,28 +65,23 @@ class SingleIntegrator(AgentModel):
 
 @compiled
 def drifting_integrator_drift(x: FloatArray, out: FloatArray) -> None:
-    """Write the drift of DriftingIntegrator at x (B, rows, 2) into `out` of the same shape; both may be strided.
+    """Write the drift of DriftingIntegrator at the columns x (2 agents, B) into `out` of the same shape.
 
-    Columns are gathered into contiguous blocks first: a loop over a stride known only at run time doesn't vectorise.
+    Rows alternate between x1 and x2; the loop runs along whichever axis is longer, so that it vectorises.
     """
-    batch, rows, _ = x.shape
-    step = max(1, _BLOCK // max(1, rows))
-    half_sum = np.empty(step * rows)
-    half_difference = np.empty(step * rows)
-    for first in range(0, batch, step):
-        count = min(step, batch - first)
-        for b in range(count):
-            for r in range(rows):
-                half_sum[b * rows + r] = 0.5 * x[first + b, r, 0] + 0.5 * x[first + b, r, 1]
-                half_difference[b * rows + r] = 0.5 * x[first + b, r, 0] - 0.5 * x[first + b, r, 1]
-        for i in range(count * rows):
-            half_sum[i] = tanh(half_sum[i])
-        for i in range(count * rows):
-            half_difference[i] = sin(half_difference[i])
-        for b in range(count):
-            for r in range(rows):
-                out[first + b, r, 0] = half_sum[b * rows + r]
-                out[first + b, r, 1] = half_difference[b * rows + r]
+    agents, batch = x.shape[0] // 2, x.shape[1]
+    if batch >= agents:
+        for r in range(agents):
+            for b in range(batch):
+                out[2 * r, b] = tanh(0.5 * (x[2 * r, b] + x[2 * r + 1, b]))
+            for b in range(batch):
+                out[2 * r + 1, b] = sin(0.5 * (x[2 * r, b] - x[2 * r + 1, b]))
+    else:
+        for b in range(batch):
+            for r in range(agents):
+                out[2 * r, b] = tanh(0.5 * (x[2 * r, b] + x[2 * r + 1, b]))
+            for r in range(agents):
+                out[2 * r + 1, b] = sin(0.5 * (x[2 * r, b] - x[2 * r + 1, b]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +102,11 @@ class DriftingIntegrator(AgentModel):
 
     def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """The f of the paper's simulation section, compiled."""
-        stacked = x if x.ndim == 3 else x.reshape(1, -1, 2)
-        out = np.empty(stacked.shape)
-        drifting_integrator_drift(stacked, out)
-        return out.reshape(x.shape)
+        batch, agents = x.shape[:2] if x.ndim == 3 else (1, x.size // 2)
+        columns = x.reshape(batch, agents, 2).transpose(1, 2, 0).reshape(2 * agents, batch)  # a view in a simulator
+        out = np.empty(columns.shape)
+        drifting_integrator_drift(columns, out)
+        return out.reshape(agents, 2, batch).transpose(2, 0, 1).reshape(x.shape)
 
     def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
         """Input map g = u."""

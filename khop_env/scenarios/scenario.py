@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.observers import Bound, ObserverDesign, PerformanceFunction, TargetObservers
+from khop_env.observers import Bound, Exponential, ObserverDesign, PerformanceFunction, TargetObservers
 from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
 from khop_env.simulation import InitialSet, Integrator, Law, Observe, Proximal, Simulator
 
@@ -121,6 +121,42 @@ class Scenario:
             self.observers,
         )
 
+    def sized(self, margin: float = 1.25) -> Scenario:
+        """A copy whose bounds start `margin` times as wide as the initial set needs; final values and rates stay.
+
+        Bounds given for all agents stay one function, bounds given by type get one per component.
+
+        Raises:
+            ValueError: if a bound isn't `Exponential`, or margin isn't above 1.
+        """
+        if not margin > 1.0:
+            raise ValueError(f"margin must exceed 1, or states could start on the funnel's wall; got {margin!r}")
+        design, resized = self.design, {}
+        for name, funnels, radius in (
+            ("delta", design.states, self.initial.radius),
+            ("theta", design.inputs, self.fleet.input_map_bound),
+        ):
+            bounds = getattr(self, name)
+            if bounds is None:
+                continue
+            needed = margin * funnels.smallest_initial_bound(radius)
+            if not isinstance(bounds, Mapping):
+                resized[name] = _widened(bounds, needed.max(initial=0.0))
+                continue
+            agent_type = np.array([self.models[i].type for i in funnels.layout.target])[funnels.layout.row_target]
+            resized[name] = {
+                kind: [
+                    _widened(one, needed[agent_type == kind].reshape(-1, n)[:, c].max(initial=0.0))
+                    for c, one in enumerate(bound if isinstance(bound, Sequence) else [bound] * n)
+                ]
+                for kind, bound in bounds.items()
+                for n in [next(model.n for model in self.models if model.type == kind)]
+            }
+        copy = self.replace(**resized)
+        theta = None if copy.theta is None else copy._per_agent(copy.theta, "theta")
+        copy.__dict__["design"] = design.with_bounds(copy._per_agent(copy.delta, "delta"), theta)
+        return copy
+
     def build(
         self,
         *,
@@ -156,3 +192,9 @@ class Scenario:
             if key not in types:
                 raise ValueError(f"scenario {self.name!r}: {name} is given for {key!r}; {did_you_mean(key, types)}")
         return {i: bounds[model.type] for i, model in enumerate(self.models) if model.type in bounds}
+
+
+def _widened(bound: PerformanceFunction, initial: float) -> Exponential:
+    if not isinstance(bound, Exponential):
+        raise ValueError(f"only Exponential bounds can be sized; got {bound!r}")
+    return Exponential(max(float(initial), bound.final), bound.final, bound.rate)

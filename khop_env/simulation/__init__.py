@@ -1,6 +1,7 @@
 """THE CLOCK: world and belief advance together. Everything with dt in it is here."""
 
 from khop_env.simulation.integrators import Explicit, FunnelError, Integrator, Proximal, SolveError
+from khop_env.simulation.messages import MessagePassing
 from khop_env.simulation.simulator import Extremes, InitialSet, Simulator
 from khop_env.simulation.state import SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, View
@@ -13,6 +14,7 @@ __all__ = [
     "InitialSet",
     "Integrator",
     "Law",
+    "MessagePassing",
     "Observe",
     "Proximal",
     "Simulator",

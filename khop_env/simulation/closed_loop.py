@@ -45,7 +45,8 @@ class ClosedLoop:
         self.views = ViewBuilder(design, task, observe, batch) if task is not None else None
         self._known_drift = _runs_with_drift(design)
         self._input_columns = _shared_columns(self.state_layout, self.input_layout)
-        self._w = np.zeros((batch, self.fleet.n))
+        self._all_drift_known = sum(columns.stop - columns.start for _, columns, _ in self._known_drift) == self.state_layout.size
+        self._w = np.zeros((self.fleet.n, batch)).T  # (B, n) in the memory order of the states
 
     def command(self, t: FloatArray, x: FloatArray, estimate: FloatArray, out: FloatArray) -> None:
         """Write the law's inputs (m, B) into `out`; without a law leave the held ones there.
@@ -74,11 +75,12 @@ class ClosedLoop:
 
     def belief(self, t: FloatArray, estimate: FloatArray, input_estimate: FloatArray, out: FloatArray) -> None:
         """Write the state observers' non-stiff part f_i(x_hat) + g_hat into `out` (P, B)."""
-        out.fill(0.0)
+        if not self._all_drift_known:
+            out.fill(0.0)
         times = t[:, None]
         for model, columns, pairs in self._known_drift:
             rates = model.drift(times, estimate[columns].T.reshape(self.batch, pairs, model.n))
-            out[columns].T.reshape(self.batch, pairs, model.n)[:] = rates
+            out[columns] = rates.reshape(self.batch, -1).T
         for state_columns, input_columns in self._input_columns:
             out[state_columns] += input_estimate[input_columns]
 

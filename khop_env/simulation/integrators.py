@@ -106,6 +106,8 @@ class Proximal:
         self.order, self.threads = order, threads
         self.evaluations = 0
         self._tableau = TABLEAUS[order]
+        self._explicit = [np.array(row) for row in self._tableau.explicit]
+        self._implicit = [np.array(row) for row in self._tableau.implicit]
         self._pool: tuple[int, ThreadPoolExecutor] | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -137,17 +139,16 @@ class Proximal:
         Raises:
             SolveError: if a state, input, disturbance or estimate isn't finite.
         """
-        loop, tableau = self._loop, self._tableau
+        loop = self._loop
         t0 = state.t.copy()
         np.copyto(self._x0, state.x)
         np.copyto(self._y0, state.estimate)
         np.copyto(self._ghat0, state.input_estimate)
-        for s, node in enumerate(tableau.nodes):
+        for s, node in enumerate(self._tableau.nodes):
             # slopes at the stage before; the state holds that stage's values, at its time
             loop.plant(state.t, state.x, state.g, state.drawn, self._plant[s])
             loop.belief(state.t, state.estimate, state.input_estimate, self._belief[s])
-            explicit = dt * np.array(tableau.explicit[s])
-            implicit = dt * np.array(tableau.implicit[s])
+            explicit, implicit = self._explicit[s] * dt, self._implicit[s] * dt
             tau = float(implicit[s])
             np.add(t0, node * dt, out=state.t)
             _weighted_sum(self._x0, explicit, self._plant[: s + 1], state.x)

@@ -97,10 +97,7 @@ class Simulator:
         self._state = SimulatorState.zeros(batch, self.fleet.n, self.fleet.m, *sizes, draws)
         self.integrator.prepare(self._loop)
         self._extremes = np.zeros((4, batch))
-        self._scratch = [
-            (np.zeros((f.layout.size, batch)), np.ones((f.layout.rows, batch)), np.ones((f.layout.rows, batch)))
-            for f in (design.states, design.inputs)
-        ]
+        self._rho = [np.ones((funnels.layout.rows, batch)) for funnels in (design.states, design.inputs)]
         self.reset(seed=0)
 
     # -- reading -------------------------------------------------------------------------------------------------
@@ -256,15 +253,10 @@ class Simulator:
     def _watch(self) -> None:
         """Raise the running extremes to those of the present state."""
         state = self._state
-        for index, funnels, estimate, source in (
-            (0, self.design.states, state.estimate, state.x),
-            (2, self.design.inputs, state.input_estimate, state.g),
+        for funnels, estimate, source, rho, running in (
+            (self.design.states, state.estimate, state.x, self._rho[0], self._extremes[:2]),
+            (self.design.inputs, state.input_estimate, state.g, self._rho[1], self._extremes[2:]),
         ):
-            if not funnels.layout.size:
-                continue
-            xi, rho, delta = self._scratch[index // 2]
-            disagreement(*funnels.layout.arrays, estimate, source, xi)
-            funnels.rho.evaluate(state.t, rho)
-            funnels.delta.evaluate(state.t, delta)
-            normalized, relative = self._extremes[index], self._extremes[index + 1]
-            extremes(funnels.layout.plan, xi, rho, delta, estimate, source, normalized, relative)
+            if funnels.layout.size:
+                funnels.rho.evaluate(state.t, rho)
+                extremes(*funnels.layout.arrays, estimate, source, rho, funnels.gain, running)

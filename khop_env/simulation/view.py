@@ -87,15 +87,16 @@ class ViewBuilder:
 
     def update(self, x: FloatArray, estimate: FloatArray) -> View:
         """The view at states `x` (n, B) and estimates (P, B)."""
-        _displacements(self._kind, self._own, self._other, x, estimate, self._columns)
+        displacements(self._kind, self._own, self._other, x, estimate, self._columns)
         self.view.x = x.T
         return self.view
 
 
 @compiled
-def _displacements(
+def displacements(
     kind: IntArray, own: IntArray, other: IntArray, x: FloatArray, estimate: FloatArray, out: FloatArray
 ) -> None:
+    """Write (E, d, B) displacements along task edges: kind 0 reads the state, 1 an estimate, 2 leaves what is there."""
     for edge in range(kind.size):
         if kind[edge] == 2:
             continue

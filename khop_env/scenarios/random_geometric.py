@@ -1,0 +1,55 @@
+"""A family of generated fleets of any size, for scaling and for training on many graphs."""
+
+from __future__ import annotations
+
+import networkx as nx
+import numpy as np
+
+from khop_env.observers import Exponential
+from khop_env.physics import SingleIntegrator, Sinusoid, hop_distances, random_geometric_graph
+from khop_env.scenarios.scenario import LawChoice, Scenario
+
+MEAN_DEGREE = 5.0
+GAIN = 2.0
+
+
+def random_geometric(agents: int = 100, k: int = 2, seed: int = 0) -> Scenario:
+    """Single integrators on a random geometric graph, each to agree with its nearest neighbours out of earshot.
+
+    Agents are uniform points at unit density, hear each other within the range that makes the mean degree about 5, and
+    are connected by construction: the Euclidean minimum spanning tree is added. The task graph is a spanning tree of
+    communication edges, so that the team can agree, and for every agent an edge to one that it estimates but can't
+    hear. The bounds' initial values are sized from the initial set, so that every member of the family is feasible.
+
+    Args:
+        agents: N, from 4 to 10 000 and more.
+        k: agents up to k hops away are estimated, at least 2.
+        seed: of the positions, and of who is to agree with whom.
+
+    Raises:
+        ValueError: for fewer than 4 agents or k below 2.
+    """
+    if agents < 4:
+        raise ValueError(f"random_geometric needs at least 4 agents; got agents={agents}")
+    rng = np.random.default_rng(seed)
+    communication, _ = random_geometric_graph(agents, MEAN_DEGREE, rng)
+    task = nx.Graph(nx.bfs_edges(communication, 0))
+    task.add_nodes_from(range(agents))
+    for i, reached in enumerate(hop_distances(communication, k)):
+        unheard = [j for j, hops in reached.items() if hops >= 2]
+        if unheard:
+            task.add_edge(i, int(rng.choice(unheard)))
+    most_edges = max(degree for _, degree in task.degree)
+    return Scenario(
+        name="random_geometric",
+        description=f"{agents} single integrators on a random geometric graph, k = {k}, seed {seed}",
+        models=(SingleIntegrator(input_limit=GAIN * most_edges),) * agents,
+        communication=communication,
+        task=task,
+        k=k,
+        delta=Exponential(1.0, 0.1, 5.0),
+        theta=Exponential(1.0, 1.0, 5.0),
+        disturbance=Sinusoid(0.3, frequency=(0.5, 2.0)),
+        radius=1.5,
+        law=LawChoice("tanh", {"gain": GAIN}),
+    ).sized()

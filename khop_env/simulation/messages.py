@@ -1,0 +1,184 @@
+"""The observers as robots would run them: one object per agent that knows only what its neighbours sent.
+
+A reference for the batched right-hand side, slow and plain: what an agent can't compute here, no agent can compute.
+`Explicit(MessagePassing)` integrates it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from khop_env.observers import FloatArray, Funnels, PerformanceFunction
+from khop_env.physics import AgentModel
+from khop_env.simulation.closed_loop import ClosedLoop
+from khop_env.simulation.state import SimulatorState
+
+
+@dataclass(frozen=True)
+class Message:
+    """What an agent broadcasts to its 1-hop neighbours.
+
+    Attributes:
+        state: its own x_i, (n_i,).
+        input_map: its own g_i(u_i), (n_i,).
+        relayed: under the relay assumption, x and g of each of its neighbours, which it measures.
+        estimates: its estimate of each of its targets' states.
+        input_estimates: likewise of their input maps.
+    """
+
+    state: FloatArray
+    input_map: FloatArray
+    relayed: Mapping[int, tuple[FloatArray, FloatArray]]
+    estimates: Mapping[int, FloatArray]
+    input_estimates: Mapping[int, FloatArray]
+
+
+@dataclass
+class Observation:
+    """What one agent holds about one target: design data, fixed, and its two estimates."""
+
+    model: AgentModel
+    drift_known: bool
+    rho: tuple[PerformanceFunction, ...]
+    omega: tuple[PerformanceFunction, ...] | None
+    peers: tuple[int, ...]
+    relays: tuple[int, ...]
+    estimate: FloatArray = field(default_factory=lambda: np.zeros(0))
+    input_estimate: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+class ObserverAgent:
+    """One agent's observers: reads its inbox, and nothing else.
+
+    Args:
+        index: which agent it is.
+        targets: what it holds about each agent that it estimates. `peers` are its neighbours that estimate the target
+            too; `relays` those that tell it the target's true state: common neighbours, or the target itself.
+    """
+
+    def __init__(self, index: int, targets: dict[int, Observation]) -> None:
+        self.index, self.targets = index, targets
+
+    def message(
+        self, state: FloatArray, input_map: FloatArray, measured: Mapping[int, tuple[FloatArray, FloatArray]]
+    ) -> Message:
+        """What it sends: its own state and input, what it measures of its neighbours, and its estimates."""
+        return Message(
+            state,
+            input_map,
+            measured,
+            {i: target.estimate for i, target in self.targets.items()},
+            {i: target.input_estimate for i, target in self.targets.items() if target.omega is not None},
+        )
+
+    def derivative(self, t: float, i: int, inbox: Mapping[int, Message]) -> tuple[FloatArray, ...]:
+        """Rates of change of its estimates of target `i`, (n_i,) each, and the normalised disagreements e and q.
+
+        Without an input observer of that target the second and the fourth are empty.
+        """
+        target = self.targets[i]
+        heard = [inbox[p].relayed.get(i, (inbox[p].state, inbox[p].input_map)) for p in target.relays]
+        xi = np.zeros_like(target.estimate)
+        for peer in target.peers:
+            xi += target.estimate - inbox[peer].estimates[i]
+        for state, _ in heard:
+            xi += target.estimate - state
+        rate, e = _correction(t, xi, target.rho)
+        if target.drift_known:
+            rate = rate + target.model.drift(np.array([t]), target.estimate[None])[0]
+        if target.omega is None:
+            return rate, np.zeros(0), e, np.zeros(0)
+        mu = np.zeros_like(target.input_estimate)
+        for peer in target.peers:
+            mu += target.input_estimate - inbox[peer].input_estimates[i]
+        for _, input_map in heard:
+            mu += target.input_estimate - input_map
+        input_rate, q = _correction(t, mu, target.omega)
+        return rate + target.input_estimate, input_rate, e, q
+
+
+def _correction(t: float, xi: FloatArray, funnels: tuple[PerformanceFunction, ...]) -> tuple[FloatArray, FloatArray]:
+    rho = np.array([float(funnel(np.array([t]))[0]) for funnel in funnels])
+    e = xi / rho
+    with np.errstate(invalid="ignore", divide="ignore"):  # |e| >= 1 is reported by the integrator
+        return -2.0 / (1.0 - e**2) * np.log((1.0 + e) / (1.0 - e)) / rho, e
+
+
+class MessagePassing:
+    """The observers' derivative, agent by agent and message by message; a `RightHandSide`.
+
+    Args:
+        loop: the closed loop whose observers these are.
+    """
+
+    def __init__(self, loop: ClosedLoop) -> None:
+        self._loop = loop
+        design, graph = loop.design, loop.design.communication
+        rho = _per_target(design.states)
+        omega = _per_target(design.inputs)
+        self.agents: list[ObserverAgent] = []
+        for a in range(len(design.fleet)):
+            neighbors = set(graph[a])
+            targets = {}
+            for i in design.neighborhoods[a]:  # graph distance is symmetric: a estimates whoever estimates a
+                relays = neighbors & set(graph[i]) if design.relay else neighbors & {i}
+                targets[i] = Observation(
+                    design.fleet.models[i],
+                    design.options[i].drift,
+                    rho[i],
+                    omega.get(i),
+                    peers=tuple(sorted(neighbors & set(design.neighborhoods[i]))),
+                    relays=tuple(sorted(relays)),
+                )
+            self.agents.append(ObserverAgent(a, targets))
+
+    def __call__(
+        self, state: SimulatorState, rho: FloatArray, omega: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """See `RightHandSide`."""
+        dy, e = np.zeros_like(state.estimate), np.zeros_like(state.estimate)
+        dghat, q = np.zeros_like(state.input_estimate), np.zeros_like(state.input_estimate)
+        for env in range(state.t.size):
+            self._one(state, env, dy, dghat, e, q)
+        return dy, dghat, e, q
+
+    def _one(
+        self, state: SimulatorState, env: int, dy: FloatArray, dghat: FloatArray, e: FloatArray, q: FloatArray
+    ) -> None:
+        design, fleet = self._loop.design, self._loop.fleet
+        slot, input_slot = design.states.layout.slot, design.inputs.layout.slot
+        for agent in self.agents:
+            for i, target in agent.targets.items():
+                at, n = slot[agent.index, i], target.model.n
+                target.estimate = state.estimate[at : at + n, env]
+                if target.omega is not None:
+                    at = input_slot[agent.index, i]
+                    target.input_estimate = state.input_estimate[at : at + n, env]
+
+        own = [
+            (state.x[fleet.state_slice(i), env], state.g[fleet.state_slice(i), env]) for i in range(len(fleet))
+        ]
+        graph = design.communication
+        sent = [
+            agent.message(*own[agent.index], {j: own[j] for j in graph[agent.index]} if design.relay else {})
+            for agent in self.agents
+        ]
+        for agent in self.agents:
+            inbox = {j: sent[j] for j in graph[agent.index]}
+            for i, target in agent.targets.items():
+                rate, input_rate, normalized, input_normalized = agent.derivative(float(state.t[env]), i, inbox)
+                at, n = slot[agent.index, i], target.model.n
+                dy[at : at + n, env], e[at : at + n, env] = rate, normalized
+                if target.omega is not None:
+                    at = input_slot[agent.index, i]
+                    dghat[at : at + n, env], q[at : at + n, env] = input_rate, input_normalized
+
+
+def _per_target(funnels: Funnels) -> dict[int, tuple[PerformanceFunction, ...]]:
+    layout, functions = funnels.layout, funnels.rho.functions
+    return {
+        int(i): functions[row : row + n] for i, (_, n, _, _, row, _) in zip(layout.target, layout.plan, strict=True)
+    }
