@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from numba.core.caching import FunctionCache, NullCache
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -80,3 +81,12 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
 class _NoCache(NullCache):  # type: ignore[misc]
     def load_overload(self, *args: Any) -> None:
         _announce(kept=False)
+
+
+@inlined
+def place(index: int) -> Any:
+    """An index that is known not to be negative, for computed indices in inner loops.
+
+    For all the compiler knows `start + q` may be negative and count from the end, and then the loop doesn't vectorise.
+    """
+    return np.uint64(index)

@@ -55,6 +55,7 @@ def disagreement(
         source: (n, B) the fleet's true vector, of which an observer uses what its neighbours relay.
         out: (P, B) xi, written.
     """
+    batch = estimate.shape[1]
     for t in range(plan.shape[0]):
         eta, n, offset, origin, pair = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 5]
         for a in range(eta):
@@ -62,15 +63,14 @@ def disagreement(
             for c in range(n):
                 column = offset + a * n + c
                 if h == 0.0:  # nobody tells it: the state must not even be read
-                    for env in range(estimate.shape[1]):
+                    for env in range(batch):
                         out[column, env] = d * estimate[column, env]
                 else:
-                    for env in range(estimate.shape[1]):
+                    for env in range(batch):
                         out[column, env] = d * estimate[column, env] - h * source[origin + c, env]
-            for k in range(link_start[pair + a], link_start[pair + a + 1]):
-                for c in range(n):
-                    column, other = offset + a * n + c, offset + link[k] * n + c
-                    for env in range(estimate.shape[1]):
+                for k in range(link_start[pair + a], link_start[pair + a + 1]):
+                    other = offset + link[k] * n + c
+                    for env in range(batch):
                         out[column, env] -= estimate[other, env]
 
 
@@ -85,19 +85,20 @@ def correction(plan: IntArray, xi: FloatArray, rho: FloatArray, e: FloatArray, o
         e: (P, B) normalised disagreement, written.
         out: (P, B) correction, written; meaningless where |e| >= 1, which the caller has to refuse.
     """
+    batch = xi.shape[1]
+    scale = np.empty(batch)
     for t in range(plan.shape[0]):
         eta, n, offset, row = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 4]
         for c in range(n):
-            for env in range(xi.shape[1]):
-                scale = 1.0 / rho[row + c, env]
-                for a in range(eta):
-                    out[offset + a * n + c, env] = scale
-    flat_xi, flat_e, flat_out = xi.reshape(-1), e.reshape(-1), out.reshape(-1)
-    for q in range(flat_xi.size):
-        scale = flat_out[q]
-        normalized = flat_xi[q] * scale
-        flat_e[q] = normalized
-        flat_out[q] = -transformation_slope(normalized) * transformation(normalized) * scale
+            for env in range(batch):
+                scale[env] = 1.0 / rho[row + c, env]
+            for a in range(eta):
+                column = offset + a * n + c
+                for env in range(batch):
+                    normalized = xi[column, env] * scale[env]
+                    e[column, env] = normalized
+                    rate = -transformation_slope(normalized) * transformation(normalized)
+                    out[column, env] = rate * scale[env]
 
 
 @compiled

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from khop_env.compiled import compiled, inlined
+from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import expm1
 
 if TYPE_CHECKING:
@@ -70,6 +70,19 @@ def eps_of_impulse(z: float) -> float:
 
 
 @compiled
+def _barriers(rows: int, lanes: int, u: FloatArray, e: FloatArray, z: FloatArray, gain: FloatArray) -> None:
+    """The barrier at u[:rows, :lanes]; in one long loop where nothing lies between the rows."""
+    if lanes == u.shape[1]:
+        flat_u, flat_e, flat_z, flat_gain = u.reshape(-1), e.reshape(-1), z.reshape(-1), gain.reshape(-1)
+        for q in range(rows * lanes):
+            flat_e[q], flat_z[q], flat_gain[q] = _barrier(flat_u[q])
+    else:
+        for a in range(rows):
+            for lane in range(lanes):
+                e[a, lane], z[a, lane], gain[a, lane] = _barrier(u[a, lane])
+
+
+@compiled
 def _newton_step(
     members: tuple[int, int, int],
     diagonal: FloatArray,
@@ -83,48 +96,47 @@ def _newton_step(
 ) -> None:
     """Solve (diag(de/dz) + s M) dz = b - e - s M z for all lanes, by L D L' in the profile of M (no square roots)."""
     eta, pair, lanes = members
-    b, e, z, gain, dz, pivot, row = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    b, e, z, gain, dz, pivot, entry = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
     for a in range(eta):
-        d, at, begin = diagonal[pair + a], a * lanes, first[pair + a]
-        for q in range((a - begin) * lanes):
-            row[q] = 0.0
+        d, begin = diagonal[pair + a], first[pair + a]
         for lane in range(lanes):
-            dz[at + lane] = d * z[at + lane]
+            dz[a, lane] = d * z[a, lane]
+        for j in range(begin, a):
+            for lane in range(lanes):
+                entry[j, lane] = 0.0
         for k in range(link_start[pair + a], link_start[pair + a + 1]):
-            other = link[k] * lanes
+            other = link[k]
             for lane in range(lanes):
-                dz[at + lane] -= z[other + lane]
-            if link[k] < a:
-                place = (link[k] - begin) * lanes
+                dz[a, lane] -= z[other, lane]
+            if other < a:
                 for lane in range(lanes):
-                    row[place + lane] = -scale[lane]
+                    entry[other, lane] = -scale[lane]
         for lane in range(lanes):
-            s, q = scale[lane], e[at + lane]
-            dz[at + lane] = b[at + lane] - q - s * dz[at + lane]
-            pivot[at + lane] = 0.5 * (1.0 - q * q) * gain[at + lane] + s * d
+            normalized = e[a, lane]
+            dz[a, lane] = b[a, lane] - normalized - scale[lane] * dz[a, lane]
+            pivot[a, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * d
         for j in range(begin, a):
-            to = (j - begin) * lanes
             for k in range(max(begin, first[pair + j]), j):
-                past, factor = (k - begin) * lanes, (row_start[j] + k) * lanes
+                factor = row_start[j] + k
                 for lane in range(lanes):
-                    row[to + lane] -= row[past + lane] * lower[factor + lane]
+                    entry[j, lane] -= entry[k, lane] * lower[factor, lane]
         for j in range(begin, a):
-            to, past, factor = (j - begin) * lanes, j * lanes, (row_start[a] + j) * lanes
+            factor = row_start[a] + j
             for lane in range(lanes):
-                entry = row[to + lane]
-                multiplier = entry * pivot[past + lane]
-                lower[factor + lane] = multiplier
-                pivot[at + lane] -= entry * multiplier
-                dz[at + lane] -= multiplier * dz[past + lane]
+                multiplier = entry[j, lane] * pivot[j, lane]
+                lower[factor, lane] = multiplier
+                pivot[a, lane] -= entry[j, lane] * multiplier
+                dz[a, lane] -= multiplier * dz[j, lane]
         for lane in range(lanes):
-            pivot[at + lane] = 1.0 / pivot[at + lane]
-    for q in range(eta * lanes):
-        dz[q] *= pivot[q]
+            pivot[a, lane] = 1.0 / pivot[a, lane]
+    for a in range(eta):
+        for lane in range(lanes):
+            dz[a, lane] *= pivot[a, lane]
     for a in range(eta - 1, 0, -1):
         for j in range(first[pair + a], a):
-            to, factor = j * lanes, (row_start[a] + j) * lanes
+            factor = row_start[a] + j
             for lane in range(lanes):
-                dz[to + lane] -= lower[factor + lane] * dz[a * lanes + lane]
+                dz[j, lane] -= lower[factor, lane] * dz[a, lane]
 
 
 @compiled
@@ -168,104 +180,97 @@ def solve(
         Evaluations of the barrier (one per pair, component and Newton iteration), then the environment and the line of
         `plan` where the solve failed, -1 and -1 if it didn't. It fails on input that isn't finite.
     """
-    widest = profile = 1
-    narrowest, most = LANES, LANES
+    widest = profile = most = 1
     for t in range(targets[0], targets[1]):
         eta, n, pair = plan[t, 0], plan[t, 1], plan[t, 5]
         entries = 0
         for a in range(eta):
             entries += a - first[pair + a]
         widest, profile = max(widest, eta), max(profile, entries)
-        narrowest, most = min(narrowest, n), max(most, n)
-    work = np.empty((9, widest * most))
+        most = max(most, n * min(max(1, LANES // n), batch[1] - batch[0]))
+    work = np.empty((9, widest, most))
     b, e, z, gain, dz, u, answer = work[0], work[1], work[2], work[3], work[4], work[7], work[8]
-    lower = np.empty(profile * most)
+    lower = np.empty((profile, most))
     row_start = np.empty(widest, np.int64)
     inv_rho, scale, worst, active = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
     evaluations = 0
 
-    tile = max(1, LANES // narrowest)
-    for b0 in range(batch[0], batch[1], tile):
-        for t in range(targets[0], targets[1]):
-            eta, n, offset, origin, row, pair = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 4], plan[t, 5]
-            chunk = max(1, most // n)
-            for c0 in range(b0, min(b0 + tile, batch[1]), chunk):
-                c1 = min(c0 + chunk, b0 + tile, batch[1])
-                lanes = (c1 - c0) * n  # a lane is one component in one environment
-                total = eta * lanes
-                width = c1 - c0
+    for t in range(targets[0], targets[1]):
+        eta, n, offset, origin, row, pair = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 4], plan[t, 5]
+        entries = 0
+        for a in range(eta):
+            row_start[a] = entries - first[pair + a]
+            entries += a - first[pair + a]
+        chunk = max(1, LANES // n)
+        for c0 in range(batch[0], batch[1], chunk):
+            width = min(chunk, batch[1] - c0)
+            lanes = n * width  # a lane is one component in one environment
+            for c in range(n):
+                for env in range(width):
+                    lane = place(c * width + env)
+                    inverse = 1.0 / rho[row + c, place(c0 + env)]
+                    inv_rho[lane] = inverse
+                    scale[lane] = tau * inverse * inverse
+                    worst[lane] = source[origin + c, place(c0 + env)]
+            for a in range(eta):
                 for c in range(n):
+                    column = offset + a * n + c
                     for env in range(width):
-                        lane = c * width + env
-                        r = 1.0 / rho[row + c, c0 + env]
-                        inv_rho[lane] = r
-                        scale[lane] = tau * r * r
-                        worst[lane] = source[origin + c, c0 + env]
-                        active[lane] = 1.0
-                for column in range(eta * n):
-                    for env in range(width):
-                        answer[column * width + env] = predictor[offset + column, c0 + env]
-                        u[column * width + env] = eps[offset + column, c0 + env]
-                entries = 0
-                for a in range(eta):
-                    d, h, at = diagonal[pair + a], relay[pair + a], a * lanes
-                    row_start[a] = entries - first[pair + a]
-                    entries += a - first[pair + a]
+                        answer[a, place(c * width + env)] = predictor[column, place(c0 + env)]
+                        u[a, place(c * width + env)] = eps[column, place(c0 + env)]
+            for a in range(eta):
+                d, h = diagonal[pair + a], relay[pair + a]
+                for lane in range(lanes):
+                    b[a, lane] = d * answer[a, lane] - h * worst[lane]
+                for k in range(link_start[pair + a], link_start[pair + a + 1]):
+                    other = link[k]
                     for lane in range(lanes):
-                        b[at + lane] = d * answer[at + lane] - h * worst[lane]
-                    for k in range(link_start[pair + a], link_start[pair + a + 1]):
-                        other = link[k] * lanes
-                        for lane in range(lanes):
-                            b[at + lane] -= answer[other + lane]
-                    for lane in range(lanes):
-                        b[at + lane] *= inv_rho[lane]
+                        b[a, lane] -= answer[other, lane]
+                for lane in range(lanes):
+                    b[a, lane] *= inv_rho[lane]
+            for lane in range(lanes):
+                active[lane] = 1.0
 
-                iteration = 0
-                moving = True
-                while moving:
-                    for q in range(total):
-                        e[q], z[q], gain[q] = _barrier(u[q])
-                    _newton_step((eta, pair, lanes), diagonal, link_start, link, first, scale, work, lower, row_start)
-                    evaluations += total
-                    iteration += 1
+            iteration = 0
+            moving = True
+            while moving:
+                _barriers(eta, lanes, u, e, z, gain)
+                _newton_step((eta, pair, lanes), diagonal, link_start, link, first, scale, work, lower, row_start)
+                evaluations += eta * lanes
+                iteration += 1
+                for lane in range(lanes):
+                    worst[lane] = 0.0
+                # a lane that is done must not move again, or its result would depend on its company
+                for a in range(eta):
                     for lane in range(lanes):
-                        worst[lane] = 0.0
+                        on = active[lane] > 0.0
+                        step = dz[a, lane] * gain[a, lane] if on else 0.0
+                        worst[lane] = max(abs(step), worst[lane])
+                        answer[a, lane] = z[a, lane] + dz[a, lane] if on else answer[a, lane]
+                        u[a, lane] += step
+                moving = False
+                longest = 0.0
+                for lane in range(lanes):
+                    on = not worst[lane] <= TOLERANCE  # so that a NaN goes on, to be reported
+                    active[lane] = 1.0 if on else 0.0
+                    moving = moving or on
+                    longest = max(longest, worst[lane])
+                if longest > _LONG_STEP:
                     for a in range(eta):
-                        at = a * lanes
                         for lane in range(lanes):
-                            worst[lane] = max(worst[lane], abs(dz[at + lane] * gain[at + lane]))
-                    # a lane that is done must not move again, or its result would depend on its company
-                    for a in range(eta):
-                        at = a * lanes
-                        for lane in range(lanes):
-                            q = at + lane
-                            on = active[lane] > 0.0
-                            answer[q] = z[q] + dz[q] if on else answer[q]
-                            u[q] = u[q] + dz[q] * gain[q] if on else u[q]
-                    moving = False
-                    longest = 0.0
+                            if active[lane] > 0.0 and abs(dz[a, lane] * gain[a, lane]) > _LONG_STEP:
+                                u[a, lane] = eps_of_impulse(answer[a, lane])
+                if moving and iteration == MAX_ITERATIONS:
                     for lane in range(lanes):
-                        worst[lane] *= active[lane]
-                        on = not worst[lane] <= TOLERANCE  # so that a NaN goes on, to be reported
-                        active[lane] = 1.0 if on else 0.0
-                        moving = moving or on
-                        longest = max(longest, worst[lane])
-                    if longest > _LONG_STEP:
-                        for a in range(eta):
-                            for lane in range(lanes):
-                                q = a * lanes + lane
-                                if active[lane] > 0.0 and abs(dz[q] * gain[q]) > _LONG_STEP:
-                                    u[q] = eps_of_impulse(answer[q])
-                    if moving and iteration == MAX_ITERATIONS:
-                        for lane in range(lanes):
-                            if active[lane] > 0.0:
-                                return evaluations, c0 + lane % width, t
-                for column in range(eta * n):
-                    lane = column % n * width
+                        if active[lane] > 0.0:
+                            return evaluations, c0 + lane % width, t
+            for a in range(eta):
+                for c in range(n):
+                    column = offset + a * n + c
                     for env in range(width):
-                        q = column * width + env
-                        correction = -answer[q] * inv_rho[lane + env]
-                        eps[offset + column, c0 + env] = u[q]
-                        slope[offset + column, c0 + env] = correction
-                        estimate[offset + column, c0 + env] = predictor[offset + column, c0 + env] + tau * correction
+                        lane, at = place(c * width + env), place(c0 + env)
+                        correction = -answer[a, lane] * inv_rho[lane]
+                        eps[column, at] = u[a, lane]
+                        slope[column, at] = correction
+                        estimate[column, at] = predictor[column, at] + tau * correction
     return evaluations, -1, -1

@@ -85,6 +85,11 @@ class ViewBuilder:
             displacement=self._columns.transpose(2, 0, 1),
         )
 
+    @property
+    def sources(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Per edge where the compiled loop reads: what kind of value (E,), own and other's position columns (E, d)."""
+        return self._kind, self._own, self._other
+
     def update(self, x: FloatArray, estimate: FloatArray) -> View:
         """The view at states `x` (n, B) and estimates (P, B)."""
         displacements(self._kind, self._own, self._other, x, estimate, self._columns)

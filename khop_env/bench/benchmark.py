@@ -1,0 +1,234 @@
+"""The benchmark: what the proximal step saves, how far it is from the bare arithmetic, and how it grows.
+
+Every figure is a ratio of times taken in this run, each the best of several repeats, or a memory size.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from agents import make_law
+from khop_env.bench.yardsticks import CompiledPaper, bare_loop
+from khop_env.observers import FloatArray
+from khop_env.scenarios import Scenario, paper, random_geometric
+from khop_env.simulation import Proximal, Simulator
+from khop_env.simulation.proximal import solve
+
+DURATION = 10.0  # s, of the closed loop
+ACCURACY = 2e-3  # largest error of x that a method may make over it
+DT = 0.01
+EXPLICIT_DT = 1e-5
+BATCH = 64
+Progress = Callable[[str], None]
+
+
+def benchmark(quick: bool = False, progress: Progress | None = None) -> dict[str, Any]:
+    """Run all benchmarks.
+
+    Args:
+        quick: a hundredth of the work, to see that everything runs; the figures mean little.
+        progress: called with a line before each part.
+
+    Returns:
+        "machine" and "rows", each row with name, value, unit and target (the bound that the project sets itself).
+    """
+    say = progress or (lambda line: None)
+    rows: list[dict[str, Any]] = []
+
+    def add(name: str, value: float | None, unit: str = "x", target: str = "") -> None:
+        rows.append({"name": name, "value": None if value is None else float(value), "unit": unit, "target": target})
+
+    say("proximal against explicit, closed loop of `paper`")
+    _against_explicit(add, quick)
+    say("proximal against SciPy's stiff solvers")
+    _against_scipy(add, quick, say)
+    say("the solve against its bare arithmetic")
+    add("ratio_to_floor", _ratio_to_floor(quick), target="at most 6")
+    _growth(add, quick, say)
+    return {"machine": _machine(), "rows": rows}
+
+
+def _best(action: Callable[[], object], repeats: int) -> float:
+    """Shortest of several timings, in s."""
+    best = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        action()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def _simulator(scenario: Scenario, batch: int, order: int = 2) -> Simulator:
+    return scenario.build(law=make_law(scenario.law), integrator=Proximal(order), batch=batch)
+
+
+def _run(simulator: Simulator, dt: float, duration: float, watch: Callable[[FloatArray], object] | None = None) -> None:
+    simulator.reset(seed=0)
+    for _ in range(round(duration / dt)):
+        simulator.step(dt)
+        if watch is not None:
+            watch(simulator.x[0].copy())
+
+
+def _trajectory(dt: float, duration: float, every: int = 1) -> FloatArray:
+    """States of `paper` after every `every` steps of order 2, (samples, n)."""
+    samples: list[FloatArray] = []
+    _run(_simulator(paper(), 1), dt, duration, samples.append)
+    return np.array(samples[every - 1 :: every])
+
+
+def _against_explicit(add: Callable[..., None], quick: bool) -> None:
+    duration = DURATION / 100 if quick else DURATION
+    fine = 20
+    reference = _trajectory(DT / fine, duration, every=fine)
+    error = np.abs(_trajectory(DT, duration) - reference).max()
+    add("proximal_error", error, "m", f"at most {ACCURACY:g}")
+    for batch, suffix, target in ((BATCH, "", "at least 60, aim 100"), (1, "_single", "at least 25")):
+        simulator = _simulator(paper(), batch)
+        _run(simulator, DT, 10 * DT)
+        proximal = _best(lambda s=simulator: _run(s, DT, duration), 2 if batch > 1 else 5) / duration
+        simulator.reset(seed=0)
+        loop = CompiledPaper(simulator)
+        loop.run(EXPLICIT_DT, 10)
+        steps = 200 if quick else (20_000 if batch > 1 else 200_000)  # of equal cost, so a part of the 10 s will do
+        explicit = _best(lambda c=loop, n=steps: c.run(EXPLICIT_DT, n), 2) / (steps * EXPLICIT_DT)
+        add(f"speedup_vs_explicit{suffix}", explicit / proximal, target=target)
+        elements = 2 * simulator.design.states.layout.size * batch  # state and input observers
+        bare = _bare_time(elements, steps) / (steps * EXPLICIT_DT)
+        add(f"explicit_to_floor{suffix}", explicit / bare, target="at most 2" if batch > 1 else "")
+        add(f"proximal{suffix}", proximal / batch * 1e3, "ms per environment and simulated s")
+        add(f"explicit{suffix}", explicit / batch * 1e3, "ms per environment and simulated s")
+
+
+def _bare_time(elements: int, repeats: int) -> float:
+    e = np.random.default_rng(0).uniform(-0.95, 0.95, elements)
+    slope, curvature = np.empty(elements), np.empty(elements)
+    bare_loop(e, slope, curvature, 1)
+    return _best(lambda: bare_loop(e, slope, curvature, repeats), 3)
+
+
+def _against_scipy(add: Callable[..., None], quick: bool, say: Progress) -> None:
+    """The loosest tolerance of each stiff solver that keeps the accuracy, on the same right-hand side, compiled."""
+    try:
+        from scipy.integrate import solve_ivp
+    except ImportError:
+        say("SciPy isn't installed (pip install 'khop_env[bench]'): left out")
+        add("speedup_vs_scipy", None, target="at least 20, aim 50")
+        return
+    duration = 0.2 if quick else DURATION
+    reference = _trajectory(DT / 20, duration, every=20)
+    times = DT * np.arange(1, len(reference) + 1)
+    single = _simulator(paper(), 1)
+    _run(single, DT, 10 * DT)
+    ours = _best(lambda: _run(single, DT, duration), 5)
+    many = _simulator(paper(), BATCH)
+    _run(many, DT, 10 * DT)
+    ours_many = _best(lambda: _run(many, DT, duration), 2) / BATCH
+    single.reset(seed=0)
+    loop = CompiledPaper(single)
+    start = np.concatenate([block[:, 0] for block in loop.z])
+    best = np.inf
+    for method in ("BDF", "Radau", "LSODA"):
+        for tolerance in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
+            began = time.perf_counter()
+            with np.errstate(all="ignore"):  # trial points outside the funnel
+                found = solve_ivp(
+                    loop.derivative, (0.0, duration), start, method, t_eval=times, rtol=tolerance, atol=tolerance
+                )
+            elapsed = time.perf_counter() - began
+            kept = found.success and np.abs(found.y[: reference.shape[1]].T - reference).max() <= ACCURACY
+            if kept:
+                say(f"  {method}: rtol = atol = {tolerance:g}, {elapsed:.2f} s")
+                best = min(best, elapsed)
+                break
+            if elapsed > 10.0 * ours * 1000.0:  # hopeless: a thousandfold already
+                break
+        else:
+            say(f"  {method}: {ACCURACY:g} not reached with rtol down to 1e-4")
+    add("speedup_vs_scipy", best / ours, target="at least 20, aim 50")
+    add("speedup_vs_scipy_batch", best / ours_many, target="")
+
+
+def _ratio_to_floor(quick: bool, batch: int = 1024) -> float:
+    """Time of the compiled solve per pair, component and Newton iteration, over the bare loop's per element."""
+    simulator = _simulator(paper(), 16 if quick else batch)
+    for _ in range(5):
+        simulator.step(DT)
+    layout, state = simulator.design.states.layout, simulator._state
+    arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
+    tau = DT * (1.0 - 1.0 / np.sqrt(2.0))
+    whole = (0, simulator.batch), (0, len(layout.plan))
+    rho = np.empty((layout.rows, simulator.batch))
+    estimate, slope = np.empty_like(state.estimate), np.empty_like(state.estimate)
+    seconds, evaluations = 0.0, 0
+    for _ in range(3 if quick else 50):  # along a run, so that the warm starts are those of one
+        simulator.step(DT)
+        predictor, eps = state.estimate + tau * DT, state.eps.copy()
+        simulator.design.states.rho.evaluate(state.t, rho)
+        start = time.perf_counter()
+        count, failed, _ = solve(*arrays, tau, predictor, state.x, rho, eps, estimate, slope, *whole)
+        seconds += time.perf_counter() - start
+        evaluations += count
+        assert failed < 0
+    elements = layout.size * simulator.batch
+    return (seconds / evaluations) / (_bare_time(elements, 20) / (20 * elements))
+
+
+def _growth(add: Callable[..., None], quick: bool, say: Progress) -> None:
+    """Time and memory per pair of `random_geometric`, each size in a process of its own."""
+    sizes = (100, 1000) if quick else (100, 1000, 10_000)
+    measured = []
+    for agents in sizes:
+        say(f"growth: {agents} agents")
+        script = f"import json; from khop_env.bench.benchmark import one_size; print(json.dumps(one_size({agents})))"
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+        measured.append(json.loads(done.stdout.splitlines()[-1]))
+        row = measured[-1]
+        add(f"step_{agents}", row["seconds"] / row["pairs"] * 1e9, "ns per pair and step")
+        add(f"memory_{agents}", row["bytes"] / row["pairs"], "bytes per pair")
+        add(f"peak_{agents}", row["peak"] / 2**20, "MiB", "below 1024" if agents == 10_000 else "")
+    for name, key in (("growth_time", "seconds"), ("growth_memory", "bytes")):
+        per_pair = [row[key] / row["pairs"] for row in measured]
+        add(name, max(per_pair) / min(per_pair), target="at most 1.5")
+
+
+def one_size(agents: int) -> dict[str, float]:
+    """Step time and memory of one member of `random_geometric`; small ones in batches of about 10 000 agents.
+
+    Memory is what building the simulator and stepping it allocates, per environment, as NumPy reports it.
+    """
+    import resource
+    import tracemalloc
+
+    scenario = random_geometric(agents=agents, k=2, seed=0)
+    _simulator(scenario, 1).step(DT)
+    batch = max(1, 10_000 // agents)
+    tracemalloc.start()
+    simulator = _simulator(scenario, batch)
+    simulator.step(DT)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    for _ in range(20):
+        simulator.step(DT)
+    seconds = _best(lambda: [simulator.step(DT) for _ in range(10)], 5) / 10 / batch
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {"pairs": scenario.design.states.layout.pairs, "seconds": seconds, "bytes": held / batch, "peak": peak}
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+    }

@@ -1,0 +1,125 @@
+"""What the proximal step is measured against, compiled as well as it is: a bare loop and the explicit step of `paper`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from agents.consensus import TanhConsensus, sum_tanh
+from khop_env.compiled import compiled
+from khop_env.elementary import log_ratio
+from khop_env.observers import FloatArray, IntArray
+from khop_env.observers.disagreement import correction, disagreement
+from khop_env.observers.performance import exponentials
+from khop_env.physics import drifting_integrator_drift
+from khop_env.physics.waveforms import add_sines
+from khop_env.simulation import Simulator
+from khop_env.simulation.view import displacements
+
+
+@compiled
+def bare_loop(e: FloatArray, slope: FloatArray, curvature: FloatArray, repeats: int) -> None:
+    """phi' (with T in it) and phi'' once per element, and nothing else: what any solver has to evaluate."""
+    for _ in range(repeats):
+        for q in range(e.size):
+            transformed = log_ratio(e[q])
+            weight = 1.0 / ((1.0 - e[q]) * (1.0 + e[q]))
+            slope[q] = 2.0 * transformed * weight
+            curvature[q] = 4.0 * (1.0 + e[q] * transformed) * weight * weight
+
+
+@compiled
+def closed_loop_derivative(
+    states: tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray],
+    inputs: tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray],
+    funnels: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
+    sines: tuple[FloatArray, IntArray, FloatArray],
+    law: tuple[float, IntArray, IntArray, IntArray, IntArray],
+    t: FloatArray,
+    z: tuple[FloatArray, FloatArray, FloatArray],
+    dz: tuple[FloatArray, FloatArray, FloatArray],
+    work: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Write the rates of x, x_hat and g_hat of `paper` into `dz`, by the compiled pieces that the simulator calls."""
+    x, y, ghat = z
+    dx, dy, dghat = dz
+    terms, u, e, xi, rho, w = work
+    displacements(law[2], law[3], law[4], x, y, terms)
+    sum_tanh(law[0], law[1], terms, u)
+    g = u.reshape(x.shape)
+    drifting_integrator_drift(x, dx)
+    w[:] = 0.0
+    add_sines(t, sines[0], 1, sines[1], sines[2], w)
+    for column in range(x.shape[0]):
+        for env in range(x.shape[1]):
+            dx[column, env] += g[column, env] + w[env, column]
+    exponentials(t, funnels[3], funnels[4], funnels[5], rho)
+    disagreement(inputs[0], inputs[1], inputs[2], inputs[3], inputs[4], ghat, g, xi)
+    correction(inputs[0], xi, rho, e, dghat)
+    exponentials(t, funnels[0], funnels[1], funnels[2], rho)
+    disagreement(states[0], states[1], states[2], states[3], states[4], y, x, xi)
+    correction(states[0], xi, rho, e, dy)
+    drifting_integrator_drift(y, xi)
+    for column in range(y.shape[0]):
+        for env in range(y.shape[1]):
+            dy[column, env] += xi[column, env] + ghat[column, env]
+
+
+@compiled
+def explicit_steps(
+    states: Any, inputs: Any, funnels: Any, sines: Any, law: Any, t: Any, z: Any, dz: Any, work: Any, dt: float, steps: int
+) -> None:
+    """Forward Euler, all steps in one compiled call, in place."""
+    for _ in range(steps):
+        closed_loop_derivative(states, inputs, funnels, sines, law, t, z, dz, work)
+        for env in range(t.size):
+            t[env] += dt
+        for block in range(3):
+            values, rates = z[block].reshape(-1), dz[block].reshape(-1)
+            for q in range(values.size):
+                values[q] += dt * rates[q]
+
+
+class CompiledPaper:
+    """The closed loop of the `paper` scenario without any Python in it.
+
+    Args:
+        simulator: built from `paper` with its law; its state is where the loop starts, and isn't changed.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        loop, state = simulator._loop, simulator._state
+        views, law = loop.views, loop.law
+        assert views is not None and isinstance(law, TanhConsensus)
+        assert loop.disturbance is not None
+        term, channels, part = loop.disturbance._parts[0]
+        pairs, batch = loop.state_layout.size, simulator.batch
+        self.t = state.t.copy()
+        self.z = (state.x.copy(), state.estimate.copy(), state.input_estimate.copy())
+        self._dz = tuple(np.zeros_like(block) for block in self.z)
+        self._constants = (
+            loop.state_layout.arrays,
+            loop.input_layout.arrays,
+            (*loop.rho.coefficients, *loop.omega.coefficients),
+            (np.ascontiguousarray(state.drawn[:, part]), channels.index, channels.amplitude),
+            (law.gain, views.view.edges, *views.sources),
+        )
+        self._work = (
+            np.zeros((len(views.view.edges), 2, batch)),
+            np.zeros((len(simulator.fleet), 2, batch)),
+            *(np.zeros((pairs, batch)) for _ in range(2)),
+            np.zeros((loop.state_layout.rows, batch)),
+            np.zeros((batch, simulator.fleet.n)),
+        )
+
+    def run(self, dt: float, steps: int) -> None:
+        """Take explicit steps."""
+        explicit_steps(*self._constants, self.t, self.z, self._dz, self._work, dt, steps)
+
+    def derivative(self, t: float, flat: FloatArray) -> FloatArray:
+        """The right-hand side as SciPy wants it, for a batch of one: all three blocks in one vector."""
+        cuts = np.cumsum([block.size for block in self.z])
+        blocks = tuple(np.ascontiguousarray(part)[:, None] for part in np.split(flat, cuts[:-1]))
+        closed_loop_derivative(*self._constants, np.array([t]), blocks, self._dz, self._work)
+        return np.concatenate([rate[:, 0] for rate in self._dz])
