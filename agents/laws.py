@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from agents.consensus import TanhConsensus
 from khop_env.physics import did_you_mean
@@ -25,4 +24,6 @@ def make_law(choice: LawChoice | str) -> Law:
     try:
         return LAWS[choice.name](**choice.parameters)
     except TypeError as error:
-        raise ValueError(f"law {choice.name!r} doesn't take the parameters {dict(choice.parameters)}: {error}") from error
+        raise ValueError(
+            f"law {choice.name!r} doesn't take the parameters {dict(choice.parameters)}: {error}"
+        ) from error

@@ -68,8 +68,8 @@ def velocity_to_input(model: AgentModel, x: FloatArray, velocity: FloatArray) ->
     controller = VELOCITY_CONTROLLERS.get(model.type)
     if controller is None:
         raise ValueError(
-            f"no velocity controller for agents of type {model.type!r}; there is one for "
-            f"{', '.join(VELOCITY_CONTROLLERS)}. Add yours: VELOCITY_CONTROLLERS[{model.type!r}] = function(model, x, v)"
+            f"no velocity controller for agents of type {model.type!r}; known: "
+            f"{', '.join(VELOCITY_CONTROLLERS)}. Add VELOCITY_CONTROLLERS[{model.type!r}] = function(model, x, v)"
         )
     u = controller(model, x, velocity)
     return np.minimum(np.maximum(u, -model.input_limit), model.input_limit)

@@ -39,7 +39,7 @@ def _cached(dispatcher: Any, function: F) -> F:
         dispatcher._cache = _KernelCache(function)
     except RuntimeError:  # Numba: no folder can be written
         dispatcher._cache = _NoCache()
-    return dispatcher  # type: ignore[no-any-return]
+    return dispatcher
 
 
 @functools.cache
@@ -60,7 +60,7 @@ def _announce(kept: bool) -> None:
     print(f"khop_env: compiling for this machine, up to a minute in all ({where}) ...", file=sys.stderr, flush=True)
 
 
-class _KernelCache(FunctionCache):  # type: ignore[misc]
+class _KernelCache(FunctionCache):
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         self._cache_file._source_stamp = _fingerprint()
@@ -78,7 +78,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
             self.disable()
 
 
-class _NoCache(NullCache):  # type: ignore[misc]
+class _NoCache(NullCache):
     def load_overload(self, *args: Any) -> None:
         _announce(kept=False)
 

@@ -5,6 +5,7 @@ Every figure is a ratio of times taken in this run, each the best of several rep
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import platform
@@ -95,12 +96,12 @@ def _against_explicit(add: Callable[..., None], quick: bool) -> None:
     for batch, suffix, target in ((BATCH, "", "at least 60, aim 100"), (1, "_single", "at least 25")):
         simulator = _simulator(paper(), batch)
         _run(simulator, DT, 10 * DT)
-        proximal = _best(lambda s=simulator: _run(s, DT, duration), 2 if batch > 1 else 5) / duration
+        proximal = _best(functools.partial(_run, simulator, DT, duration), 2 if batch > 1 else 5) / duration
         simulator.reset(seed=0)
         loop = CompiledPaper(simulator)
         loop.run(EXPLICIT_DT, 10)
         steps = 200 if quick else (20_000 if batch > 1 else 200_000)  # of equal cost, so a part of the 10 s will do
-        explicit = _best(lambda c=loop, n=steps: c.run(EXPLICIT_DT, n), 2) / (steps * EXPLICIT_DT)
+        explicit = _best(functools.partial(loop.run, EXPLICIT_DT, steps), 2) / (steps * EXPLICIT_DT)
         add(f"speedup_vs_explicit{suffix}", explicit / proximal, target=target)
         elements = 2 * simulator.design.states.layout.size * batch  # state and input observers
         bare = _bare_time(elements, steps) / (steps * EXPLICIT_DT)
@@ -217,9 +218,14 @@ def one_size(agents: int) -> dict[str, float]:
     simulator.step(DT)
     held, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    for _ in range(20):
-        simulator.step(DT)
-    seconds = _best(lambda: [simulator.step(DT) for _ in range(10)], 5) / 10 / batch
+
+    def ten_steps() -> None:
+        for _ in range(10):
+            simulator.step(DT)
+
+    ten_steps()
+    ten_steps()
+    seconds = _best(ten_steps, 5) / 10 / batch
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return {"pairs": scenario.design.states.layout.pairs, "seconds": seconds, "bytes": held / batch, "peak": peak}
 

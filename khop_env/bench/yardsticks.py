@@ -1,4 +1,4 @@
-"""What the proximal step is measured against, compiled as well as it is: a bare loop and the explicit step of `paper`."""
+"""What the proximal step is measured against, as well compiled: a bare loop and the explicit step of `paper`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from agents.consensus import TanhConsensus, sum_tanh
 from khop_env.compiled import compiled
 from khop_env.elementary import log_ratio
-from khop_env.observers import FloatArray, IntArray
+from khop_env.observers import FloatArray
 from khop_env.observers.disagreement import correction, disagreement
 from khop_env.observers.performance import exponentials
 from khop_env.physics import drifting_integrator_drift
@@ -20,7 +20,7 @@ from khop_env.simulation.view import displacements
 
 @compiled
 def bare_loop(e: FloatArray, slope: FloatArray, curvature: FloatArray, repeats: int) -> None:
-    """phi' (with T in it) and phi'' once per element, and nothing else: what any solver has to evaluate."""
+    """Phi' (with T in it) and phi'' once per element, and nothing else: what any solver has to evaluate."""
     for _ in range(repeats):
         for q in range(e.size):
             transformed = log_ratio(e[q])
@@ -31,15 +31,7 @@ def bare_loop(e: FloatArray, slope: FloatArray, curvature: FloatArray, repeats: 
 
 @compiled
 def closed_loop_derivative(
-    states: tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray],
-    inputs: tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray],
-    funnels: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
-    sines: tuple[FloatArray, IntArray, FloatArray],
-    law: tuple[float, IntArray, IntArray, IntArray, IntArray],
-    t: FloatArray,
-    z: tuple[FloatArray, FloatArray, FloatArray],
-    dz: tuple[FloatArray, FloatArray, FloatArray],
-    work: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
+    states: Any, inputs: Any, funnels: Any, sines: Any, law: Any, t: FloatArray, z: Any, dz: Any, work: Any
 ) -> None:
     """Write the rates of x, x_hat and g_hat of `paper` into `dz`, by the compiled pieces that the simulator calls."""
     x, y, ghat = z
@@ -68,7 +60,17 @@ def closed_loop_derivative(
 
 @compiled
 def explicit_steps(
-    states: Any, inputs: Any, funnels: Any, sines: Any, law: Any, t: Any, z: Any, dz: Any, work: Any, dt: float, steps: int
+    states: Any,
+    inputs: Any,
+    funnels: Any,
+    sines: Any,
+    law: Any,
+    t: Any,
+    z: Any,
+    dz: Any,
+    work: Any,
+    dt: float,
+    steps: int,
 ) -> None:
     """Forward Euler, all steps in one compiled call, in place."""
     for _ in range(steps):
@@ -91,9 +93,10 @@ class CompiledPaper:
     def __init__(self, simulator: Simulator) -> None:
         loop, state = simulator._loop, simulator._state
         views, law = loop.views, loop.law
-        assert views is not None and isinstance(law, TanhConsensus)
+        assert views is not None
+        assert isinstance(law, TanhConsensus)
         assert loop.disturbance is not None
-        term, channels, part = loop.disturbance._parts[0]
+        _, channels, part = loop.disturbance._parts[0]
         pairs, batch = loop.state_layout.size, simulator.batch
         self.t = state.t.copy()
         self.z = (state.x.copy(), state.estimate.copy(), state.input_estimate.copy())

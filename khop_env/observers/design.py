@@ -9,6 +9,7 @@ The norm of the funnels of one target may be at most lambda_min(M_i) times the s
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -163,9 +164,10 @@ class ObserverDesign:
                 f"theta is missing: {len(observed_inputs)} agents have an input observer, the first "
                 f"{fleet.ids[observed_inputs[0]]!r}; give a bound theta or set input_observer=False"
             )
-        common = {"dimensions": dimensions, "offsets": fleet.state_offset, "relay": self.relay}
-        states = PairLayout.build(self.communication, neighborhoods, **common)
-        inputs = PairLayout.build(self.communication, neighborhoods, targets=observed_inputs, **common)
+        lay_out = functools.partial(
+            PairLayout.build, self.communication, neighborhoods, dimensions, fleet.state_offset, relay=self.relay
+        )
+        states, inputs = lay_out(), lay_out(targets=observed_inputs)
         values = {
             "neighborhoods": neighborhoods,
             "options": tuple(options),
@@ -197,11 +199,9 @@ class ObserverDesign:
         """One performance function per row of the layout."""
         rows: list[PerformanceFunction] = []
         for i, (_, n, *_) in zip(layout.target, layout.plan, strict=True):
-            bound = bounds
-            if isinstance(bounds, Mapping):
-                if int(i) not in bounds:
-                    raise DesignError(f"{name} has no bound for agent {self.fleet.ids[i]!r}; give one per target")
-                bound = bounds[int(i)]
+            if isinstance(bounds, Mapping) and int(i) not in bounds:
+                raise DesignError(f"{name} has no bound for agent {self.fleet.ids[i]!r}; give one per target")
+            bound = bounds[int(i)] if isinstance(bounds, Mapping) else bounds
             several = list(bound) if isinstance(bound, Sequence) else [bound] * int(n)
             if len(several) != n or not all(isinstance(one, PerformanceFunction) for one in several):
                 raise DesignError(

@@ -72,7 +72,12 @@ class PairLayout:
             targets: agents to observe; all by default.
         """
         adjacency = [frozenset(graph[node]) - {node} for node in range(graph.number_of_nodes())]
-        plan, target, observer, heard, diagonal, first = [], [], [], [], [], []
+        plan: list[tuple[int, ...]] = []
+        target: list[int] = []
+        observer: list[int] = []
+        heard: list[int] = []
+        diagonal: list[int] = []
+        first: list[int] = []
         links: list[int] = []
         link_start = [0]
         size = rows = 0

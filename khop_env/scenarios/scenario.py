@@ -75,7 +75,9 @@ class Scenario:
     def __post_init__(self) -> None:
         agents = len(self.models)
         validate_graph(self.communication, agents)
-        check_task_graph(validate_graph(self.task, agents, name="task graph", connected=False), self.communication, self.k)
+        check_task_graph(
+            validate_graph(self.task, agents, name="task graph", connected=False), self.communication, self.k
+        )
         for name in ("center", "radius"):
             values = np.asarray(getattr(self, name), dtype=float)
             if values.shape not in ((), (self.fleet.n,)) or not np.all(np.isfinite(values)):
@@ -131,7 +133,8 @@ class Scenario:
         """
         if not margin > 1.0:
             raise ValueError(f"margin must exceed 1, or states could start on the funnel's wall; got {margin!r}")
-        design, resized = self.design, {}
+        design = self.design
+        resized: dict[str, Bounds] = {}
         for name, funnels, radius in (
             ("delta", design.states, self.initial.radius),
             ("theta", design.inputs, self.fleet.input_map_bound),

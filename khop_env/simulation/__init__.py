@@ -1,6 +1,7 @@
 """THE CLOCK: world and belief advance together. Everything with dt in it is here."""
 
-from khop_env.simulation.integrators import Explicit, FunnelError, Integrator, Proximal, SolveError
+from khop_env.simulation.explicit import BatchedRightHandSide, Explicit, FunnelError, RightHandSide
+from khop_env.simulation.integrators import Integrator, Proximal, SolveError
 from khop_env.simulation.messages import MessagePassing
 from khop_env.simulation.simulator import Extremes, InitialSet, Simulator
 from khop_env.simulation.state import SimulatorState
@@ -8,6 +9,7 @@ from khop_env.simulation.view import OBSERVE, Law, Observe, View
 
 __all__ = [
     "OBSERVE",
+    "BatchedRightHandSide",
     "Explicit",
     "Extremes",
     "FunnelError",
@@ -17,6 +19,7 @@ __all__ = [
     "MessagePassing",
     "Observe",
     "Proximal",
+    "RightHandSide",
     "Simulator",
     "SimulatorState",
     "SolveError",

@@ -45,7 +45,9 @@ class ClosedLoop:
         self.views = ViewBuilder(design, task, observe, batch) if task is not None else None
         self._known_drift = _runs_with_drift(design)
         self._input_columns = _shared_columns(self.state_layout, self.input_layout)
-        self._all_drift_known = sum(columns.stop - columns.start for _, columns, _ in self._known_drift) == self.state_layout.size
+        self._all_drift_known = (
+            sum(columns.stop - columns.start for _, columns, _ in self._known_drift) == self.state_layout.size
+        )
         self._w = np.zeros((self.fleet.n, batch)).T  # (B, n) in the memory order of the states
 
     def command(self, t: FloatArray, x: FloatArray, estimate: FloatArray, out: FloatArray) -> None:

@@ -158,9 +158,7 @@ class MessagePassing:
                     at = input_slot[agent.index, i]
                     target.input_estimate = state.input_estimate[at : at + n, env]
 
-        own = [
-            (state.x[fleet.state_slice(i), env], state.g[fleet.state_slice(i), env]) for i in range(len(fleet))
-        ]
+        own = [(state.x[fleet.state_slice(i), env], state.g[fleet.state_slice(i), env]) for i in range(len(fleet))]
         graph = design.communication
         sent = [
             agent.message(*own[agent.index], {j: own[j] for j in graph[agent.index]} if design.relay else {})

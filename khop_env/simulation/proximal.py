@@ -41,7 +41,7 @@ _LONG_STEP = 0.5  # in eps: beyond it exp is not nearly linear
 
 @inlined
 def _barrier(eps: float) -> tuple[float, float, float]:
-    """e = tanh(eps / 2), z = phi'(e) = eps (1 + cosh eps), and d eps / dz, of which de/dz = de/deps d eps/dz."""
+    """E = tanh(eps / 2), z = phi'(e) = eps (1 + cosh eps), and d eps / dz, of which de/dz = de/deps d eps/dz."""
     a = abs(eps)
     growth = expm1(a)
     half = 1.0 / (growth + 2.0)

@@ -88,7 +88,8 @@ class Simulator:
         if batch < 1:
             raise ValueError(f"batch must be at least 1; got {batch!r}")
         self.design, self.fleet, self.initial, self.batch = design, design.fleet, initial, batch
-        design.require_feasible_start(initial.radius, self.fleet.input_map_bound)
+        bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` sees where it starts
+        design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         self.integrator: Integrator = integrator or Proximal()
         attached = None if disturbance is None else disturbance.attach(self.fleet)
         self._loop = ClosedLoop(design, attached, law, task, observe, batch)
@@ -155,9 +156,7 @@ class Simulator:
 
     # -- writing -------------------------------------------------------------------------------------------------
 
-    def reset(
-        self, seed: int | Sequence[int | np.random.Generator] = 0, x0: ArrayLike | None = None
-    ) -> Simulator:
+    def reset(self, seed: int | Sequence[int | np.random.Generator] = 0, x0: ArrayLike | None = None) -> Simulator:
         """Start a new episode in every environment.
 
         Args:
@@ -196,6 +195,9 @@ class Simulator:
         self.integrator.start(state)
         self._extremes[...] = 0.0
         self._watch()
+        if not np.all(self._extremes[2] < 1.0):
+            away = np.where(np.isfinite(self.g), np.abs(self.g), 0.0).max(axis=0)
+            self.design.require_feasible_start(np.zeros(self.fleet.n), away)
         return self
 
     def step(self, dt: float, u: ArrayLike | None = None) -> None:

@@ -38,8 +38,9 @@ class SimulatorState:
     @staticmethod
     def zeros(batch: int, n: int, m: int, pairs: int, input_pairs: int, draws: int) -> SimulatorState:
         """A state of zeros."""
-        rows = (n, m, n, pairs, pairs, input_pairs, input_pairs)
-        return SimulatorState(np.zeros(batch), *(np.zeros((row, batch)) for row in rows), np.zeros((batch, draws)))
+        t, drawn = np.zeros(batch), np.zeros((batch, draws))
+        x, u, g, y, eps, ghat, nu = (np.zeros((k, batch)) for k in (n, m, n, pairs, pairs, input_pairs, input_pairs))
+        return SimulatorState(t, x, u, g, y, eps, ghat, nu, drawn)
 
     def copy(self) -> SimulatorState:
         """An independent copy."""

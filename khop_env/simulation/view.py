@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -113,12 +112,3 @@ def displacements(
             else:
                 for env in range(x.shape[1]):
                     out[edge, c, env] = x[theirs, env] - x[mine, env]
-
-
-def sum_over_edges(agents: int, edges: IntArray, terms: FloatArray) -> FloatArray:
-    """(B, N, d) sums of edge terms (B, E, d) over each agent's own task edges; for laws written in plain NumPy."""
-    total = np.zeros((terms.shape[0], agents, terms.shape[2]))
-    np.add.at(total, (slice(None), edges[:, 0]), terms)
-    return total
-
-
