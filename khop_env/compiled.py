@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -57,13 +57,23 @@ def _fingerprint() -> str:
 @functools.cache
 def _announce(kept: bool) -> None:
     where = "the result is kept for later runs" if kept else "no cache folder can be written, so every process does it"
-    print(f"khop_env: compiling for this machine, up to a minute in all ({where}) ...", file=sys.stderr, flush=True)
+    print(f"khop_env: compiling for this machine, about ten seconds in all ({where}) ...", file=sys.stderr, flush=True)
+
+
+class _KernelFile(IndexDataCacheFile):
+    """Names a data file after what is in it: two processes that save at once may lose an entry but can't swap two."""
+
+    def save(self, key: Any, data: Any) -> None:
+        overloads = self._load_index()
+        overloads[key] = self._data_name(int(hashlib.sha256(repr(key).encode()).hexdigest()[:12], 16))
+        self._save_data(overloads[key], data)
+        self._save_index(overloads)
 
 
 class _KernelCache(FunctionCache):
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        self._cache_file._source_stamp = _fingerprint()
+        self._cache_file = _KernelFile(self._cache_path, self._impl.filename_base, _fingerprint())
 
     def load_overload(self, *args: Any) -> Any:
         found = super().load_overload(*args)

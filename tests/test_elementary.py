@@ -28,8 +28,16 @@ def evaluate(function, x):
 RNG = np.random.default_rng(0)
 TINY = np.concatenate([sign * 10.0 ** RNG.uniform(-300, -3, 500) for sign in (1, -1)])
 CASES = {
-    "expm1": (elementary.expm1, np.expm1, np.concatenate([RNG.uniform(-600, 600, 20_000), RNG.uniform(-1, 1, 20_000), TINY])),
-    "tanh": (elementary.tanh, np.tanh, np.concatenate([RNG.uniform(-30, 30, 20_000), RNG.uniform(-1, 1, 20_000), TINY, [0, 1e300]])),
+    "expm1": (
+        elementary.expm1,
+        np.expm1,
+        np.concatenate([RNG.uniform(-600, 600, 20_000), RNG.uniform(-1, 1, 20_000), TINY]),
+    ),
+    "tanh": (
+        elementary.tanh,
+        np.tanh,
+        np.concatenate([RNG.uniform(-30, 30, 20_000), RNG.uniform(-1, 1, 20_000), TINY, [0, 1e300]]),
+    ),
     "log_ratio": (
         elementary.log_ratio,
         lambda e: 2 * np.arctanh(e),

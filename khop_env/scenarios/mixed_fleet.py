@@ -57,7 +57,11 @@ def mixed_fleet() -> Scenario:
             "unicycle": _exponentials(0.1, 0.1, 0.05),
             "vessel": _exponentials(0.1, 0.1, 0.05, 0.1, 0.1, 0.05),
         },
-        theta={"integrator": _exponentials(0.5, 0.5), "cart": _exponentials(*[0.5] * 4), "vessel": _exponentials(*[0.5] * 6)},
+        theta={
+            "integrator": _exponentials(0.5, 0.5),
+            "cart": _exponentials(*[0.5] * 4),
+            "vessel": _exponentials(*[0.5] * 6),
+        },
         disturbance=(
             Sinusoid(0.2, frequency=(0.5, 2.0), agents="integrator")
             + BandLimitedNoise((0.0, 0.0, 0.2, 0.2), band=(0.5, 10.0), agents="cart")

@@ -41,7 +41,7 @@ def random_geometric(agents: int = 100, k: int = 2, seed: int = 0) -> Scenario:
             task.add_edge(i, int(rng.choice(unheard)))
     most_edges = max(degree for _, degree in task.degree)
     return Scenario(
-        name="random_geometric",
+        name=f"random_geometric:agents={agents},k={k},seed={seed}",
         description=f"{agents} single integrators on a random geometric graph, k = {k}, seed {seed}",
         models=(SingleIntegrator(input_limit=GAIN * most_edges),) * agents,
         communication=communication,

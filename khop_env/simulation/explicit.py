@@ -133,5 +133,5 @@ def _left_funnel(
         f"the explicit step left the funnel: {kind} observer of {agent!r} in "
         f"{fleet.ids[layout.observer[layout.column_pair[column]]]!r}, component {component!r}, environment {env}, "
         f"reached |{letter}| = {ratio[column, env]:.4g} at t = {t[env] + dt:.6g} s with dt = {dt:g} s; just before, "
-        f"a step below {min(stable, dt):.2g} s would have been stable: take a shorter one, or integrator='proximal'"
+        f"a step below {min(stable, dt):.2g} s would have been stable: take a shorter one, or the proximal integrator"
     )

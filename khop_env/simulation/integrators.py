@@ -200,14 +200,27 @@ class Proximal:
             for evaluations, env, line in results:
                 self.evaluations += evaluations
                 if env >= 0:
-                    agent = self._loop.fleet.ids[layout.target[line]]
-                    raise SolveError(
-                        f"environment {env}: the observers of {agent!r} got a state, input or funnel that isn't "
-                        f"finite and positive (state {source[layout.plan[line, 3], env]}); check the agent model, the "
-                        "law and the disturbance, or take a shorter step if the plant itself diverged"
-                    )
+                    raise SolveError(self._failure(layout, line, env, source, rho))
 
         return solve
+
+    def _failure(self, layout: PairLayout, line: int, env: int, source: FloatArray, rho: FloatArray) -> str:
+        fleet, (_, n, _, origin, row, _) = self._loop.fleet, layout.plan[line].tolist()
+        who = f"environment {env}, observers of {fleet.ids[layout.target[line]]!r}: "
+        kind = "state" if layout is self._loop.state_layout else "input map"
+        for c in range(n):
+            value, funnel, name = source[origin + c, env], rho[row + c, env], fleet.component_names()[origin + c][1]
+            if not np.isfinite(value):
+                return (
+                    f"{who}its {kind} became {value} in component {name!r}; check the agent model, the law and the "
+                    "disturbance, or take a shorter step if the plant itself diverged"
+                )
+            if not (np.isfinite(funnel) and funnel > 0.0):
+                return f"{who}the funnel of component {name!r} became {funnel}; it has to be positive and finite"
+        return (
+            f"{who}the estimates became non-finite, or the solve didn't converge in {proximal.MAX_ITERATIONS} "
+            "iterations; check the agent model's drift at the estimates, and please report the latter"
+        )
 
     def _threads(self) -> ThreadPoolExecutor:
         if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads

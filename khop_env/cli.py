@@ -1,0 +1,255 @@
+"""The command line, `khop`: list, check, run and export scenarios, and measure.
+
+Tables and one JSON object (`--json`) go to stdout; progress and messages to stderr. Exit status: 0, or 1 where a check
+or a run finds the observers' guarantee broken, or 2 for a mistake in what was asked.
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from khop_env import __version__
+from khop_env.terminal import Progress, print_table, say, waiting
+
+if TYPE_CHECKING:
+    from khop_env.scenarios import LawChoice, Scenario
+
+EXPLICIT_STEP = 1e-5  # s: how the paper samples its example
+
+app = typer.Typer(
+    name="khop",
+    help="Decentralised k-hop prescribed performance observers: the paper's experiment and yours.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+class ObserveOption(enum.StrEnum):
+    """What the law sees of agents out of earshot."""
+
+    ESTIMATE = "estimate"
+    ORACLE = "oracle"
+    LOCAL = "local"
+
+
+class IntegratorOption(enum.StrEnum):
+    """How the observers are integrated."""
+
+    PROXIMAL = "proximal"
+    EXPLICIT = "explicit"
+
+
+class OrderOption(enum.StrEnum):
+    """Order of the proximal integrator."""
+
+    ONE = "1"
+    TWO = "2"
+
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="A name (khop list), one with parameters (random_geometric:agents=100,k=2), or the path of a .toml file.",
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.command("list")
+def list_scenarios(as_json: JsonOption = False) -> None:
+    """List the scenarios, with one line each."""
+    from khop_env.registry import describe
+
+    found = describe()
+    if as_json:
+        _print_json({"scenarios": found})
+        return
+    print_table(
+        ("scenario", "parameters", "what it is"),
+        [
+            (one["name"], ", ".join(f"{key}={value}" for key, value in one["parameters"].items()), one["description"])
+            for one in found
+        ],
+    )
+
+
+@app.command()
+def check(name: ScenarioArgument, as_json: JsonOption = False) -> None:
+    """Report what the observers rest on: k-hop sets, funnels, feasibility, the paper's assumptions.
+
+    Exits with 1 if a condition of the observers doesn't hold.
+    """
+    from khop_env.results import design_report
+
+    with _mistakes(), waiting(f"designing the observers of {name}"):
+        report = design_report(_load(name))
+    if as_json:
+        _print_json(report)
+    else:
+        from khop_env.terminal import print_design
+
+        print_design(report)
+    if not report["feasible"]:
+        raise typer.Exit(1)
+
+
+@app.command()
+def run(
+    name: ScenarioArgument,
+    controller: Annotated[str | None, typer.Option(help="Feedback law; by default the scenario's.")] = None,
+    observe: Annotated[
+        ObserveOption, typer.Option(help="What the law sees of agents out of earshot.")
+    ] = ObserveOption.ESTIMATE,
+    duration: Annotated[float | None, typer.Option(help="Seconds; by default the scenario's.")] = None,
+    dt: Annotated[
+        float | None,
+        typer.Option(help=f"Step in seconds; by default the scenario's, or {EXPLICIT_STEP:g} for explicit."),
+    ] = None,
+    integrator: Annotated[IntegratorOption, typer.Option(help="Integrator.")] = IntegratorOption.PROXIMAL,
+    order: Annotated[OrderOption | None, typer.Option(help="Of the proximal integrator; the scenario's.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the initial state and the disturbance.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; by default runs/SCENARIO.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Simulate the closed loop; write its tables, its summary and the paper's figure.
+
+    Exits with 1 if a funnel was left. Whatever was computed until then is written all the same.
+    """
+    from agents import make_law
+    from khop_env.results import record, summarize, write_run
+    from khop_env.simulation import Explicit, Proximal
+
+    explicit = integrator is IntegratorOption.EXPLICIT
+    with _mistakes(), waiting(f"designing the observers of {name}"):
+        scenario = _load(name)
+        law = _law(scenario, controller)
+        if explicit and order is OrderOption.TWO:
+            raise ValueError("--order 2: the explicit integrator is forward Euler, of order 1; leave --order out")
+        stepper = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
+        dt = dt if dt is not None else EXPLICIT_STEP if explicit else scenario.dt
+        duration = scenario.duration if duration is None else duration
+        for option, value in (("--duration", duration), ("--dt", dt)):
+            if not 0.0 < value < float("inf"):
+                raise ValueError(f"{option} must be positive and finite; got {value!r}")
+        simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
+        simulator.reset(seed)
+        folder = out or Path("runs") / (re.sub(r"[^\w.-]+", "_", scenario.name) or "scenario")
+        folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost
+    with Progress(f"simulating {scenario.name}") as progress:
+        recording = record(simulator, duration, dt, progress=progress)
+    summary = summarize(
+        recording,
+        scenario,
+        seed=seed,
+        dt=dt,
+        integrator=stepper,
+        controller=law.name,
+        observe=observe.value,
+    )
+    with _mistakes(), waiting(f"writing {folder}"):
+        files = write_run(recording, scenario, summary, folder)
+    if as_json:
+        _print_json({**summary, "files": {key: str(path) for key, path in files.items()}})
+    else:
+        from khop_env.terminal import print_summary
+
+        print_summary(summary, files)
+    if recording.error is not None:
+        say(f"khop: {recording.error}")
+    if not summary["funnel_kept"]:
+        raise typer.Exit(1)
+
+
+@app.command()
+def export(name: ScenarioArgument) -> None:
+    """Print a scenario as a TOML file to start from: khop export paper > mine.toml."""
+    from khop_env.scenarios.files import write_scenario
+
+    with _mistakes(), waiting(f"writing {name}"):
+        text = write_scenario(_load(name))
+    typer.echo(text, nl=False)
+
+
+@app.command()
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes, rougher numbers.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure speed and memory against explicit, SciPy's and bare loops."""
+    from khop_env.bench import benchmark
+
+    result = benchmark(quick=quick, progress=say)
+    if as_json:
+        _print_json(result)
+        return
+    rows = [
+        tuple("" if row.get(key) is None else row[key] for key in ("name", "value", "unit", "target"))
+        for row in result["rows"]
+    ]
+    print_table(("measure", "value", "unit", "target"), [tuple(_short(cell) for cell in row) for row in rows])
+    typer.echo(f"machine: {result.get('machine')}")
+
+
+@contextmanager
+def _mistakes() -> Iterator[None]:
+    """Tell of a mistake in what was asked in one paragraph, without a traceback."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        say(f"khop: {error}")
+        raise typer.Exit(2) from None
+
+
+def _load(name: str) -> Scenario:
+    """The scenario that the user names, whose law exists.
+
+    Raises:
+        ValueError: if there is no such scenario, file or law.
+    """
+    from agents import LAWS, make_law
+    from khop_env.registry import scenario
+    from khop_env.scenarios.files import read_scenario
+
+    found = read_scenario(name, laws=LAWS) if name.endswith(".toml") else scenario(name)
+    try:
+        make_law(found.law)
+    except ValueError as error:
+        raise ValueError(f"{name}: law: {error}") from error
+    return found
+
+
+def _law(scenario: Scenario, controller: str | None) -> LawChoice:
+    from khop_env.scenarios import LawChoice
+
+    return scenario.law if controller in (None, scenario.law.name) else LawChoice(str(controller))
+
+
+def _print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def _short(cell: Any) -> str:
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)

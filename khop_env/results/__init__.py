@@ -1,0 +1,24 @@
+"""THE RECORD: trajectories as tidy tables, metrics, figures and design reports."""
+
+from khop_env.results.assumptions import Assumption, assumptions
+from khop_env.results.figures import paper_figure
+from khop_env.results.metrics import consensus_error, summarize
+from khop_env.results.recording import ObserverRecord, Recording, record
+from khop_env.results.report import design_report
+from khop_env.results.tables import estimates_table, states_table
+from khop_env.results.writing import write_run
+
+__all__ = [
+    "Assumption",
+    "ObserverRecord",
+    "Recording",
+    "assumptions",
+    "consensus_error",
+    "design_report",
+    "estimates_table",
+    "paper_figure",
+    "record",
+    "states_table",
+    "summarize",
+    "write_run",
+]

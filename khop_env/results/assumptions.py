@@ -1,0 +1,216 @@
+"""The paper's six assumptions, looked up in a scenario: which hold, which don't, and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import networkx as nx
+import numpy as np
+
+from khop_env.observers import FloatArray, FunnelBank, Funnels
+from khop_env.physics import DriftingIntegrator, SingleIntegrator
+from khop_env.scenarios import Scenario
+
+Status = Literal["holds", "doesn't hold", "holds by construction", "not known"]
+
+_MARGIN = 1.05  # Assumption 6 is checked for a bound this much above the smallest that delta can ever meet
+
+_DENSE = 1000  # agents: eigenvalues of a dense matrix take seconds beyond
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One assumption of the paper.
+
+    Attributes:
+        number: as the paper counts them.
+        statement: what it says, in short.
+        status: whether this scenario satisfies it; "not known" where the user's own functions decide.
+        why: the reason, with its numbers.
+    """
+
+    number: str
+    statement: str
+    status: Status
+    why: str
+
+
+def assumptions(scenario: Scenario) -> list[Assumption]:
+    """Assumptions 1 to 6 for a scenario whose observers can be designed."""
+    return [
+        _lipschitz_drift(scenario),
+        _measurable_input_map(scenario),
+        _bounded_disturbance(scenario),
+        _input_map(scenario),
+        Assumption(
+            "3",
+            "the graph is undirected and doesn't change; each agent knows its k-hop neighbours",
+            "holds by construction",
+            f"the graph is fixed, undirected and connected ({scenario.communication.number_of_edges()} edges), and "
+            "neighbourhoods are computed from it",
+        ),
+        _relay(scenario),
+        _nominal_controller(scenario),
+        _steady_state_bound(scenario),
+    ]
+
+
+def _lipschitz_drift(scenario: Scenario) -> Assumption:
+    constants = {model.type: model.drift_lipschitz() for model in scenario.models}
+    known = [value for value in constants.values() if math.isfinite(value)]
+    local = [kind for kind, value in constants.items() if math.isinf(value)]
+    unknown = [kind for kind, value in constants.items() if math.isnan(value)]
+    why = [f"Lipschitz with constant {max(known):.4g} (1/s) at most"] if known and len(known) == len(constants) else []
+    if known and not why:
+        names = [kind for kind, value in constants.items() if math.isfinite(value)]
+        why = [f"{_listed(names)}: Lipschitz with constant {max(known):.4g} (1/s) at most"]
+    if local:
+        why.append(
+            f"{_listed(local)}: only locally Lipschitz, but Theorem 1 uses a constant: keep states in a bounded region"
+        )
+    if unknown:
+        why.append(f"{_listed(unknown)}: no constant declared (drift_lipschitz)")
+    blind = [i for i, option in enumerate(scenario.design.options) if not option.drift]
+    if blind:
+        why.append(f"observers of {len(blind)} agents do without f (Theorem 2): their motion has to stay bounded")
+    return Assumption("1-i", "each f is locally Lipschitz", "not known" if unknown else "holds", "; ".join(why))
+
+
+def _measurable_input_map(scenario: Scenario) -> Assumption:
+    own = sorted({model.type for model in scenario.models if not type(model).__module__.startswith("khop_env.")})
+    return Assumption(
+        "1-ii",
+        "each g is measurable and locally bounded",
+        "not known" if own else "holds",
+        f"{_listed(own)}: your own model; any continuous g will do"
+        if own
+        else "the library's input maps are continuous",
+    )
+
+
+def _bounded_disturbance(scenario: Scenario) -> Assumption:
+    statement = "each w is continuous and uniformly bounded"
+    if scenario.disturbance is None:
+        return Assumption("1-iii", statement, "holds", "w = 0")
+    bound = scenario.disturbance.attach(scenario.fleet).bound
+    kinds = _listed(sorted({type(term).__name__ for term in scenario.disturbance.terms}))
+    return Assumption(
+        "1-iii", statement, "holds", f"|w| <= {bound.max():.4g} in every component, as declared by {kinds}, all smooth"
+    )
+
+
+def _input_map(scenario: Scenario) -> Assumption:
+    fleet, options = scenario.fleet, scenario.design.options
+    bounded = sum(model.input_map_bounded for model in fleet.models)
+    observed = sum(option.input_observer for option in options)
+    why = [f"(i) g is bounded for {bounded} of {len(fleet)} agents"]
+    if bounded:
+        finite = fleet.input_map_bound[np.isfinite(fleet.input_map_bound)]
+        why[0] += f", |g| <= {finite.max():.4g} in every component"
+    if observed:
+        why.append(
+            f"(ii) for the {observed} with an input observer g' is bounded under a Lipschitz law that is evaluated "
+            "along the trajectory; not under inputs that jump"
+        )
+    return Assumption("2", "each g is bounded (i), or its time derivative is (ii)", "holds", "; ".join(why))
+
+
+def _relay(scenario: Scenario) -> Assumption:
+    statement = "agents relay their neighbours' states and inputs"
+    if scenario.relay:
+        return Assumption(
+            "4", statement, "holds by construction", "relay = true: 2-hop observers are handed the true value"
+        )
+    return Assumption(
+        "4",
+        statement,
+        "doesn't hold",
+        "relay = false, and not needed: the variant of the paper's remark is used, in which 1-hop neighbours join the "
+        "k-hop set",
+    )
+
+
+def _nominal_controller(scenario: Scenario) -> Assumption:
+    statement = "under the true states the law reaches the goal set whatever w is"
+    disturbed = scenario.disturbance is not None and bool(scenario.disturbance.attach(scenario.fleet).bound.any())
+    if disturbed:
+        return Assumption(
+            "5",
+            statement,
+            "doesn't hold",
+            "no smooth bounded law cancels a persistent w: agents come close to the goal set and stay there; what "
+            "Theorem 4 says of the estimates is the excess over that distance (compare --observe oracle)",
+        )
+    status, why = _undisturbed(scenario)
+    return Assumption("5", statement, status, f"w = 0; {why}")
+
+
+def _undisturbed(scenario: Scenario) -> tuple[Status, str]:
+    """Whether the tanh law is known to agree without a disturbance."""
+    if scenario.law.name != "tanh":
+        return "not known", f"nothing is known here of the law {scenario.law.name!r}"
+    if not nx.is_connected(scenario.task):
+        return "doesn't hold", "the task graph isn't connected, so that its parts agree among themselves only"
+    if all(isinstance(model, SingleIntegrator) for model in scenario.models):
+        return "holds", "|Pi x|^2 decreases along integrators under the tanh law on a connected task graph"
+    if all(isinstance(model, DriftingIntegrator) for model in scenario.models) and len(scenario.models) <= _DENSE:
+        # near agreement tanh(z) = z: e' = (f' - k_c L_T) e, and |f'| <= l_f
+        adjacency = nx.to_numpy_array(scenario.task)
+        connectivity = np.linalg.eigvalsh(np.diag(adjacency.sum(axis=0)) - adjacency)
+        gain = float(scenario.law.parameters.get("gain", math.nan)) * float(connectivity[1])
+        lipschitz = max(model.drift_lipschitz() for model in scenario.models)
+        return "not known", (
+            f"near agreement it holds if k_c lambda_2(G_T) = {gain:.4g} exceeds l_f = {lipschitz:.4g}; far from it, "
+            "where tanh saturates, it is measured only"
+        )
+    return "not known", "for models other than integrators agreement is measured, not proven"
+
+
+def _steady_state_bound(scenario: Scenario) -> Assumption:
+    statement = "after a finite time t_x the norm of all delta stays below the accuracy asked for"
+    states = scenario.design.states
+    if not states.layout.size:
+        return Assumption("6", statement, "holds by construction", "nobody is estimated")
+    rows = states.layout.plan[states.layout.row_target, 0].astype(float)  # how many observers share each row's delta
+    floor = float(np.sqrt(rows @ states.delta.infimum() ** 2))
+    time = _first_time_below(lambda t: _norm(states, rows, t), _MARGIN * floor)
+    if time is None:
+        return Assumption(
+            "6",
+            statement,
+            "not known",
+            f"the norm of all infima is {floor:.4g}; your own delta decides when it comes near",
+        )
+    return Assumption(
+        "6",
+        statement,
+        "holds by construction",
+        f"for any accuracy above the norm of all delta(inf), {floor:.4g}, over all pairs and components; for "
+        f"{_MARGIN * floor:.4g} after t_x = {time:.3g} s",
+    )
+
+
+def _norm(states: Funnels, rows: FloatArray, t: float) -> float:
+    bank: FunnelBank = states.delta
+    values = bank.evaluate(np.array([t]), np.empty((len(bank), 1)))[:, 0]
+    return float(np.sqrt(rows @ values**2))
+
+
+def _first_time_below(norm: Callable[[float], float], level: float) -> float | None:
+    """Time in s from which a non-increasing norm stays below `level`; None if it doesn't within a year."""
+    low, high = 0.0, 1.0
+    while norm(high) > level:
+        low, high = high, 2.0 * high
+        if high > 3e7:
+            return None
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if norm(middle) > level else (low, middle)
+    return high
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:6]) + (" and others" if len(names) > 6 else "")

@@ -1,0 +1,214 @@
+"""The paper's three panels: where the agents went, and what was believed of one of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from khop_env.observers import FloatArray
+from khop_env.results.recording import ObserverRecord, Recording
+from khop_env.scenarios import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# M. Okabe and K. Ito, Color Universal Design, 2008: told apart by colour-blind readers, too; yellow left out (too pale)
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#8C8C8C")
+_ERROR, _DISAGREEMENT = COLORS[0], COLORS[3]
+_MOST_LABELS = 12  # agents told apart in panel (a)
+_MOST_POINTS = 500_000  # in panel (a)
+
+
+def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, agent: int | None = None) -> Path:
+    """Draw a run as the paper's figure does, and save it.
+
+    (a) The agents' positions, from crosses to dots. (b) The largest |estimation error| and |disagreement| over all
+    observers of one agent's state, with their bounds dashed. (c) The same for its input. Where the bounds differ
+    between components, (b) and (c) show the component that came nearest to its bound.
+
+    Args:
+        recording: of the run.
+        scenario: what was run.
+        path: of the image file; its ending decides the format.
+        agent: number of the agent shown in (b) and (c). By default the paper's Agent 4 (here 3) in `paper`, and
+            elsewhere the one with most observers.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if there is no such agent.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    shown = _default_agent(recording, scenario) if agent is None else recording.fleet.agent(agent)
+    name = recording.fleet.ids[shown]
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(13.0, 4.4), layout="constrained")
+        left, middle, right = figure.subplots(1, 3)
+        _draw_positions(left, recording)
+        _draw_observers(middle, recording, recording.states, shown, f"(b) Estimates of the state of {name}")
+        _draw_observers(right, recording, recording.inputs, shown, f"(c) Estimates of the input of {name}")
+        figure.suptitle(_headline(recording, scenario), fontsize=10.5, color="#333333")
+        figure.savefig(path, dpi=150)
+    return Path(path)
+
+
+_STYLE: Any = {
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+}
+
+
+def _default_agent(recording: Recording, scenario: Scenario) -> int:
+    if scenario.name == "paper" and len(recording.fleet) > 3:
+        return 3
+    layout = recording.design.states.layout
+    return int(layout.target[np.argmax(layout.plan[:, 0])]) if len(layout.plan) else 0
+
+
+def _headline(recording: Recording, scenario: Scenario) -> str:
+    extremes = recording.extremes
+    ratios = max(float(extremes.normalized[0]), float(extremes.input_normalized[0]))
+    over = f"over all {recording.design.states.layout.pairs} pairs"
+    if recording.error is not None:
+        return f"{scenario.name}: stopped at t = {recording.time[-1]:.4g} s, {_reason(recording)}"
+    kept = "inside all funnels" if ratios < 1.0 else "funnels left"
+    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {ratios:.3f} {over}"
+
+
+def _reason(recording: Recording) -> str:
+    return str(recording.error).split(":")[0]
+
+
+def _draw_positions(axes: Axes, recording: Recording) -> None:
+    fleet = recording.fleet
+    planar = fleet.position_dim > 1
+    thinning = max(1, recording.time.size * len(fleet) // _MOST_POINTS)
+    chosen = np.unique(np.r_[0 : len(recording.time) : thinning, len(recording.time) - 1])
+    positions = fleet.positions(recording.x[chosen])  # (T, N, d)
+    times = np.broadcast_to(recording.time[chosen, None], positions.shape[:2])
+    path = positions[:, :, :2] if planar else np.stack([times, positions[:, :, 0]], axis=-1)
+
+    few = len(fleet) <= _MOST_LABELS
+    types = list(dict.fromkeys(model.type for model in fleet.models))
+    if few and len(types) == 1:
+        groups = {fleet.ids[i].rpartition("_")[2]: [i] for i in range(len(fleet))}
+        _label_starts(axes, path[0], list(groups))
+    else:
+        groups = {kind: [i for i, model in enumerate(fleet.models) if model.type == kind] for kind in types}
+    for number, (label, members) in enumerate(groups.items()):
+        style: Any = {"color": COLORS[number % len(COLORS)], "alpha": 1.0 if few else 0.5}
+        # one broken line for all members: a line each takes minutes in a large fleet
+        broken = np.concatenate([path[:, members], np.full((1, len(members), 2), np.nan)]).swapaxes(0, 1).reshape(-1, 2)
+        axes.plot(*broken.T, linewidth=1.2 if few else 0.5, label=label, **style)
+        axes.plot(*path[0, members].T, "x", markersize=6 if few else 3.5, markeredgewidth=1.6 if few else 0.8, **style)
+        axes.plot(*path[-1, members].T, "o", markersize=3.5 if few else 1.5, **style)
+    dots = ", dots: final" if planar else ""
+    note = " (seen from above)" if fleet.position_dim > 2 else ""
+    axes.set_title(f"(a) Agents' positions{note}; crosses: initial{dots}", loc="left")
+    if len(types) > 1:
+        axes.legend(loc="best", fontsize=8.5)
+    if planar:
+        axes.set_xlabel("first coordinate (m)")
+        axes.set_ylabel("second coordinate (m)")
+        axes.set_aspect("equal", adjustable="datalim")
+    else:
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel("position (m)")
+
+
+def _label_starts(axes: Axes, starts: FloatArray, labels: list[str]) -> None:
+    """Write the agents' numbers beside their crosses, on the side that faces away from the others."""
+    from matplotlib.patheffects import withStroke
+
+    outwards = starts - starts.mean(axis=0)
+    outwards /= np.maximum(np.linalg.norm(outwards, axis=-1, keepdims=True), 1e-9)
+    for number, (label, start, away) in enumerate(zip(labels, starts, 9.0 * outwards, strict=True)):
+        text = axes.annotate(
+            label,
+            tuple(start),
+            tuple(away),
+            textcoords="offset points",
+            color=COLORS[number % len(COLORS)],
+            fontsize=8.5,
+            ha="center",
+            va="center",
+        )
+        text.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+
+
+def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agent: int, title: str) -> None:
+    axes.set_title(title, loc="left")
+    layout = kind.funnels.layout
+    line = np.flatnonzero(layout.target == agent)
+    if not line.size:
+        _explain_absence(axes, recording, agent)
+        return
+    eta, n, offset, _, first, _ = layout.plan[line[0]].tolist()
+    columns, rows = slice(offset, offset + eta * n), slice(first, first + n)
+    shape = len(kind.time), eta, n
+    truth = kind.truth[:, layout.column_source[columns]]
+    error = np.abs(kind.estimate[:, columns] - truth).reshape(shape).max(axis=1)
+    disagreement = np.abs(kind.disagreement[:, columns]).reshape(shape).max(axis=1)
+    rho = kind.funnels.rho.evaluate(kind.time, np.empty((layout.rows, len(kind.time))))[rows].T
+    delta = kind.funnels.delta.evaluate(kind.time, np.empty((layout.rows, len(kind.time))))[rows].T
+
+    names, units = (list(each) for each in zip(*recording.fleet.models[agent].states.items(), strict=True))
+    if np.all(delta == delta[:, :1]):
+        shown, error, disagreement = "max over observers, components", error.max(axis=1), disagreement.max(axis=1)
+        rho, delta = rho[:, 0], delta[:, 0]
+    else:
+        worst = int(np.argmax((error / delta).max(axis=0)))
+        shown = f"{names[worst]}: max over observers"
+        units = [units[worst]]
+        error, disagreement, rho, delta = (values[:, worst] for values in (error, disagreement, rho, delta))
+    letters = (r"\delta", r"\rho") if kind is recording.states else (r"\theta", r"\omega")
+    for values, bound, color, width, what, letter in (
+        (error, delta, _ERROR, 2.0, "|error|", letters[0]),  # wider: the two often coincide
+        (disagreement, rho, _DISAGREEMENT, 1.2, "|disagreement|", letters[1]),
+    ):
+        axes.plot(kind.time, np.where(values > 0.0, values, np.nan), color=color, linewidth=width, label=f"max {what}")
+        axes.plot(kind.time, bound, color=color, linestyle=(0, (5, 2)), label=f"its bound ${letter}(t)$")
+    axes.set_yscale("log")
+    low, high = _lowest(error, disagreement, rho), float(delta.max())
+    axes.set_ylim(low, high * (high / low) ** 0.2)  # room for the legend
+    axes.set_xlim(0.0, float(kind.time[-1]) or 1.0)
+    axes.set_xlabel("time (s)")
+    if kind is recording.inputs:
+        units = [f"{unit}/s".replace("/s/s", "/s$^2$") for unit in units]
+    units = list(dict.fromkeys(units))
+    axes.set_ylabel(f"{shown} ({', '.join(units) if len(units) < 3 else 'SI units'})")
+    axes.legend(loc="upper right", ncols=2, fontsize=8.5, handlelength=2.4, columnspacing=1.2)
+
+
+def _lowest(error: FloatArray, disagreement: FloatArray, rho: FloatArray) -> float:
+    """Lower end of the logarithmic axis: dips of a moment and rounding errors don't stretch it over many decades."""
+    values = np.concatenate([error, disagreement])
+    values = values[values > 0.0]
+    floor = 1e-6 * float(rho.min())
+    return max(floor, float(np.quantile(values, 0.02)) / 3.0) if values.size else floor
+
+
+def _explain_absence(axes: Axes, recording: Recording, agent: int) -> None:
+    """Say in an empty panel why it is empty."""
+    name, model = recording.fleet.ids[agent], recording.fleet.models[agent]
+    if not recording.design.neighborhoods[agent]:
+        why = f"No agent estimates {name}:\nall others hear it, or are too far away."
+    elif model.input_map_uses_state:
+        why = f"{name} has no input observer:\nits input map g(x, u) depends on its state."
+    else:
+        why = f"{name} has no input observer:\nits input counts as a bounded disturbance."
+    axes.text(0.5, 0.5, why, ha="center", va="center", transform=axes.transAxes, color="#555555")
+    axes.set_axis_off()

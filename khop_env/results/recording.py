@@ -1,0 +1,224 @@
+"""One simulated episode, sampled: what tables, metrics and figures are made from."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from khop_env.observers import FloatArray, FunnelBank, Funnels, ObserverDesign
+from khop_env.physics import Fleet
+from khop_env.simulation import Extremes, FunnelError, Simulator, SolveError
+
+Progress = Callable[[float], None]
+"""Called now and then with the fraction of the episode that is done."""
+
+MOST_ROWS = 5_000_000
+"""Samples times estimates that a recording may hold (40 MB an array): larger fleets are sampled less often."""
+
+_WARM_UP_STEP = 1e-9  # s: short enough for any integrator, long enough to run all of its code
+_TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.07000000000000001
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverRecord:
+    """The samples of one kind of observer: of the states (PPSO), or of the inputs' effects g (PPIO).
+
+    Attributes:
+        funnels: who estimates whom, and within which bounds; P estimates in the order of `funnels.layout`.
+        time: (T,) in s.
+        truth: (T, n) what is estimated: the fleet's x, or its g.
+        estimate: (T, P).
+        disagreement: (T, P) xi, or mu.
+    """
+
+    funnels: Funnels
+    time: FloatArray
+    truth: FloatArray
+    estimate: FloatArray
+    disagreement: FloatArray
+
+    @property
+    def truth_per_estimate(self) -> FloatArray:
+        """(T, P) the true value of what each estimate is an estimate of."""
+        return self.truth[:, self.funnels.layout.column_source]
+
+    @property
+    def error(self) -> FloatArray:
+        """(T, P) estimation errors x_tilde, or g_tilde."""
+        return self.estimate - self.truth_per_estimate
+
+    @property
+    def rho(self) -> FloatArray:
+        """(T, P) funnels on the disagreements: rho, or omega."""
+        return self._evaluate(self.funnels.rho)
+
+    @property
+    def delta(self) -> FloatArray:
+        """(T, P) bounds on the errors: delta, or theta."""
+        return self._evaluate(self.funnels.delta)
+
+    def _evaluate(self, bank: FunnelBank) -> FloatArray:
+        layout = self.funnels.layout
+        return bank.evaluate(self.time, np.empty((layout.rows, len(self.time)))).T[:, layout.column_row]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Samples of one episode in one environment, and what was seen at every step between them.
+
+    Attributes:
+        design: fleet, graph and observers.
+        x: (T, n) states.
+        u: (T, m) inputs.
+        states: what the state observers did.
+        inputs: what the input observers did; of width 0 where there are none.
+        extremes: the largest ratios over ALL steps, sampled or not; arrays of shape (1,).
+        steps: number of steps taken.
+        wall_time: seconds spent stepping and sampling; not in compiling.
+        error: why the episode ended early, or None. Everything up to then is here.
+    """
+
+    design: ObserverDesign
+    x: FloatArray
+    u: FloatArray
+    states: ObserverRecord
+    inputs: ObserverRecord
+    extremes: Extremes
+    steps: int
+    wall_time: float
+    error: FunnelError | SolveError | None = None
+
+    @property
+    def fleet(self) -> Fleet:
+        """The agents."""
+        return self.design.fleet
+
+    @property
+    def time(self) -> FloatArray:
+        """(T,) time of each sample in s: 0, then at most so many a second as were asked for, then the end."""
+        return self.states.time
+
+    @property
+    def completed(self) -> bool:
+        """Whether the episode ran to its end."""
+        return self.error is None
+
+
+def record(
+    simulator: Simulator,
+    duration: float,
+    dt: float,
+    *,
+    samples_per_second: float = 100.0,
+    progress: Progress | None = None,
+) -> Recording:
+    """Run the simulator from where it stands to `duration`, and keep samples of everything.
+
+    Step k ends at k dt, however many went before it (no drift), and the last one is shortened to end at `duration`.
+
+    Args:
+        simulator: of one environment, just reset, and with a law.
+        duration: s.
+        dt: step in s.
+        samples_per_second: at most this many; fewer where the steps are longer, or the fleet is so large that more
+            than `MOST_ROWS` numbers would be kept in an array.
+        progress: told now and then how far it is.
+
+    Returns:
+        The recording. Where the integrator gave up midway, `Recording.error` says why, and all samples before stand.
+
+    Raises:
+        ValueError: for more than one environment, or a duration or step that isn't positive and finite.
+    """
+    if simulator.batch != 1:
+        raise ValueError(f"one environment is recorded at a time; the simulator has batch={simulator.batch}")
+    for name, value in (("duration", duration), ("dt", dt), ("samples_per_second", samples_per_second)):
+        if not (value > 0.0 and math.isfinite(value)):
+            raise ValueError(f"{name} must be positive and finite; got {value!r}")
+    steps = max(1, math.ceil(duration / dt - 1e-9))
+    design = simulator.design
+    width = max(1, design.states.layout.size, design.inputs.layout.size)
+    most_samples = max(2, MOST_ROWS // width)
+    stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
+    samples = _Samples(simulator, 1 + math.ceil(steps / stride))
+    _warm_up(simulator)
+
+    error: FunnelError | SolveError | None = None
+    start = shown = clock.perf_counter()
+    samples.take()
+    done = 0
+    try:
+        for k in range(1, steps + 1):
+            until = duration if k == steps else round(k * dt, _TIME_DECIMALS)
+            simulator.step(until - float(simulator.t[0]))
+            done = k
+            if k % stride == 0 or k == steps:
+                samples.take()
+            if progress is not None and (now := clock.perf_counter()) - shown > 0.1:
+                shown = now
+                progress(k / steps)
+    except FunnelError as left:  # the state is the last one inside the funnel: worth keeping
+        error = left
+        if done % stride:
+            samples.take()
+    except SolveError as failed:  # the state is that of a step half done: not worth keeping
+        error = failed
+    wall_time = clock.perf_counter() - start
+    if progress is not None and error is None:
+        progress(1.0)
+    return samples.recording(done, wall_time, error)
+
+
+class _Samples:
+    """Arrays for all samples of an episode, filled one by one."""
+
+    def __init__(self, simulator: Simulator, count: int) -> None:
+        self._simulator = simulator
+        self._sources: dict[str, Callable[[], FloatArray]] = {
+            "time": lambda: simulator.t,
+            "x": lambda: simulator.x[0],
+            "u": lambda: simulator.u[0],
+            "g": lambda: simulator.g[0],
+            "estimate": lambda: simulator.estimates[0],
+            "disagreement": lambda: simulator.disagreements()[0],
+            "input_estimate": lambda: simulator.input_estimates[0],
+            "input_disagreement": lambda: simulator.input_disagreements()[0],
+        }
+        self._arrays = {name: np.empty((count, len(read()))) for name, read in self._sources.items()}
+        self._taken = 0
+
+    def take(self) -> None:
+        for name, read in self._sources.items():
+            self._arrays[name][self._taken] = read()
+        self._taken += 1
+
+    def recording(self, steps: int, wall_time: float, error: FunnelError | SolveError | None) -> Recording:
+        design = self._simulator.design
+        kept = {name: values[: self._taken] for name, values in self._arrays.items()}
+        time = kept["time"][:, 0]
+        return Recording(
+            design=design,
+            x=kept["x"],
+            u=kept["u"],
+            states=ObserverRecord(design.states, time, kept["x"], kept["estimate"], kept["disagreement"]),
+            inputs=ObserverRecord(design.inputs, time, kept["g"], kept["input_estimate"], kept["input_disagreement"]),
+            extremes=self._simulator.extremes,
+            steps=steps,
+            wall_time=wall_time,
+            error=error,
+        )
+
+
+def _warm_up(simulator: Simulator) -> None:
+    """Compile everything that a step runs, so that the wall time tells of stepping only; the state is put back."""
+    saved = simulator.save()
+    try:
+        simulator.step(_WARM_UP_STEP)
+    except (FunnelError, SolveError):
+        pass  # the first real step will say so again
+    finally:
+        simulator.restore(saved)

@@ -1,0 +1,121 @@
+"""The design report: what a control engineer wants to know before running, as plain JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import Any
+
+import numpy as np
+
+from khop_env.observers import DesignError, Exponential, FloatArray, Funnels, ObserverDesign, PerformanceFunction
+from khop_env.results.assumptions import assumptions
+from khop_env.scenarios import Scenario
+
+
+def design_report(scenario: Scenario) -> dict[str, Any]:
+    """Everything that the observers of a scenario rest on.
+
+    Returns:
+        feasible: whether every condition of the observers holds; `error` says which doesn't.
+        targets: per agent that is estimated: its k-hop set, eta, lambda_min and lambda_max of M_i, and under `state`
+            and `input` per group of components with equal numbers: delta and rho (theta and omega), each with its
+            value at 0 and at infinity and its rate, and start_share, the largest |xi(0)| / rho(0) over the initial
+            set.
+        explicit_step_bound_s: no explicit Euler step longer than this is stable at steady state (it has to be far
+            shorter): the smallest over all targets, for both kinds of observers.
+        assumptions: the paper's six, each with a status and why.
+        observers: agents whose observers use a simplification.
+
+    Numbers that are infinite or unknown are null.
+    """
+    report: dict[str, Any] = {
+        "scenario": scenario.name,
+        "description": scenario.description,
+        "agents": len(scenario.models),
+        "edges": scenario.communication.number_of_edges(),
+        "k": scenario.k,
+        "relay": scenario.relay,
+        "feasible": False,
+        "error": None,
+    }
+    try:
+        design = scenario.design
+    except DesignError as error:
+        return {**report, "error": str(error), "targets": [], "assumptions": []}
+    radius = {"state": scenario.initial.radius, "input": scenario.fleet.input_map_bound}
+    try:
+        design.require_feasible_start(radius["state"], radius["input"])
+        report["feasible"] = True
+    except DesignError as error:
+        report["error"] = str(error)
+    report["pairs"] = design.states.layout.pairs
+    report["estimates"] = design.states.layout.size + design.inputs.layout.size
+    report["explicit_step_bound_s"] = {
+        kind: _finite(funnels.explicit_step_bound().min(initial=np.inf)) for kind, funnels in _kinds(design)
+    }
+    targets = _targets(design)
+    for kind, funnels in _kinds(design):
+        share = funnels.feasible_at_start(radius[kind])
+        for target, groups in _funnel_groups(design, funnels, share, *_LETTERS[kind]).items():
+            targets[target][kind] = groups
+    report["targets"] = list(targets.values())
+    report["assumptions"] = [vars(one) for one in assumptions(scenario)]
+    return report
+
+
+_LETTERS = {"state": ("delta", "rho"), "input": ("theta", "omega")}
+
+
+def _kinds(design: ObserverDesign) -> tuple[tuple[str, Funnels], tuple[str, Funnels]]:
+    return ("state", design.states), ("input", design.inputs)
+
+
+def _targets(design: ObserverDesign) -> dict[int, dict[str, Any]]:
+    layout, ids = design.states.layout, design.fleet.ids
+    return {
+        i: {
+            "agent": ids[i],
+            "k_hop": [ids[j] for j in design.neighborhoods[i]],
+            "eta": len(design.neighborhoods[i]),
+            "lambda_min": smallest,
+            "lambda_max": largest,
+            "drift_known": design.options[i].drift,
+            "state": [],
+            "input": [],
+        }
+        for i, (smallest, largest) in zip(layout.target.tolist(), layout.eigenvalues.tolist(), strict=True)
+    }
+
+
+def _funnel_groups(
+    design: ObserverDesign, funnels: Funnels, share: FloatArray, bound_name: str, funnel_name: str
+) -> dict[int, list[dict[str, Any]]]:
+    """Per target: its components, those with equal bounds together."""
+    layout = funnels.layout
+    described: dict[tuple[Hashable, float], dict[str, Any]] = {}
+    targets: dict[int, list[dict[str, Any]]] = {}
+    for i, (_, n, _, _, first, _) in zip(layout.target.tolist(), layout.plan.tolist(), strict=True):
+        groups: dict[Hashable, dict[str, Any]] = {}
+        for row, component in zip(range(first, first + n), design.fleet.models[i].states, strict=True):
+            bound = funnels.bounds[row]
+            same = bound if isinstance(bound, Exponential) else id(bound)  # a user's own need not be hashable
+            key = same, float(funnels.gain[row])
+            if key not in described:
+                described[key] = {bound_name: _numbers(bound), funnel_name: _numbers(funnels.rho.functions[row])}
+            group = groups.setdefault(same, {"components": [], **described[key], "start_share": []})
+            group["components"].append(component)
+            group["start_share"].append(share[row])
+        targets[i] = [{**group, "start_share": _finite(max(group["start_share"]))} for group in groups.values()]
+    return targets
+
+
+def _numbers(function: PerformanceFunction) -> dict[str, float | None]:
+    return {
+        "initial": _finite(function(np.zeros(1))[0]),
+        "final": _finite(function.infimum()),
+        "rate": function.rate if isinstance(function, Exponential) else None,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,191 @@
+"""What the command line shows: tables and summaries on stdout, progress and messages on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+
+SHOWN_TARGETS = 20
+_SHOWN_IDS = 6  # of a k-hop set
+_PIPED_WIDTH = 160  # columns, where stdout is no terminal that could tell
+
+_UNSURE = 0.5  # s of work before it is guessed how long it will take
+_LONG = 2.0  # s: work that takes longer gets a progress bar
+
+
+def say(text: str) -> None:
+    """A message on stderr."""
+    typer.echo(text, err=True)
+
+
+class Progress:
+    """A progress bar on stderr for work that takes more than two seconds; called with the fraction that is done."""
+
+    def __init__(self, label: str) -> None:
+        self._label, self._start, self._bar = label, time.perf_counter(), None
+        self._task: Any = None
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, fraction: float) -> None:
+        """Show that `fraction` of the work is done."""
+        elapsed = time.perf_counter() - self._start
+        if self._bar is None and elapsed > _UNSURE and elapsed > _LONG * fraction:
+            self._bar, self._task = _bar(self._label)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=fraction)
+
+
+def _bar(label: str) -> tuple[Any, Any]:
+    from rich import progress
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    columns = (progress.TextColumn("{task.description}"), progress.BarColumn(), progress.TaskProgressColumn())
+    bar = progress.Progress(
+        *columns, progress.TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    )
+    bar.start()
+    return bar, bar.add_task(label, total=1.0)
+
+
+@contextmanager
+def waiting(label: str) -> Iterator[None]:
+    """A spinner on stderr while something of unknown length happens; only on a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(f"{label} ..."):
+        yield
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> None:
+    """A table on stdout."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False, show_edge=False
+    )
+    for name in header:
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    console = Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH, markup=False, highlight=False)
+    console.print(table)
+
+
+def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None:
+    """A run in five lines."""
+    observed = {"estimate": "estimates", "oracle": "the truth (oracle)", "local": "neighbours only"}[summary["observe"]]
+    typer.echo(
+        f"{summary['scenario']}: {summary['agents']} agents, {summary['pairs']} pairs of observer and target, "
+        f"{summary['duration']:.6g} s in steps of {summary['dt']:g} s ({summary['integrator']}, order "
+        f"{summary['order']}), law {summary['controller']} on {observed}, seed {summary['seed']}"
+    )
+    ratios = f"|xi|/rho {_ratio(summary['max_normalized_disagreement'])}, "
+    ratios += f"|x_tilde|/delta {_ratio(summary['max_error_to_bound'])}"
+    if summary["max_error_to_bound_input"] is not None:
+        ratios += f"; of the inputs |mu|/omega {_ratio(summary['max_normalized_disagreement_input'])}, "
+        ratios += f"|g_tilde|/theta {_ratio(summary['max_error_to_bound_input'])}"
+    if summary["funnel_kept"]:
+        typer.echo(f"guarantee kept: largest {ratios} (all below 1)")
+    elif summary["error"] is not None:
+        typer.echo(f"guarantee not kept: stopped at t = {summary['duration']:.6g} s; until then largest {ratios}")
+    else:
+        typer.echo(f"guarantee not kept: largest {ratios} (should be below 1)")
+    typer.echo(f"consensus error at the end: {summary['final_consensus_error']:.4g} m")
+    typer.echo(f"wall time: {summary['wall_time_s']:.3g} s for {summary['steps']} steps")
+    typer.echo(f"tables: {files['estimates']}, {files['states']}; summary: {files['summary']}")
+    typer.echo(f"figure: {files['figure']}")
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.3f}"
+
+
+def print_design(report: Mapping[str, Any]) -> None:
+    """The design report as tables."""
+    typer.echo(
+        f"{report['scenario']}: {report['agents']} agents, {report['edges']} edges, k = {report['k']}, "
+        f"{'with' if report['relay'] else 'without'} relay"
+    )
+    targets = report["targets"]
+    if targets:
+        rows = [row for target in targets[:SHOWN_TARGETS] for row in _target_rows(target)]
+        header = (
+            "target",
+            "k-hop set",
+            "eta",
+            "lambda(M)",
+            "of",
+            "bound on errors",
+            "funnel",
+            "rate (1/s)",
+            "start/funnel",
+        )
+        print_table(header, rows, "Observers, by the agent that they estimate: values at t = 0 -> infinity")
+        if len(targets) > SHOWN_TARGETS:
+            typer.echo(_all_targets(targets))
+        bound = {kind: value for kind, value in report["explicit_step_bound_s"].items() if value is not None}
+        values = ", ".join(f"{value:.3g} s ({kind} observers)" for kind, value in bound.items())
+        typer.echo(f"explicit integrator: no step longer than {values} is stable; take a tenth of it or less\n")
+    if report["assumptions"]:
+        rows = [(one["number"], one["status"], one["statement"], one["why"]) for one in report["assumptions"]]
+        print_table(("", "status", "assumption of the paper", "why"), rows)
+    if report["feasible"]:
+        typer.echo("feasible: every condition of the observers holds")
+    else:
+        typer.echo(f"not feasible: {report['error']}")
+
+
+def _target_rows(target: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    ids = target["k_hop"]
+    members = ", ".join(ids[:_SHOWN_IDS]) + (f" and {len(ids) - _SHOWN_IDS} more" if len(ids) > _SHOWN_IDS else "")
+    first: tuple[str, ...] = (
+        target["agent"],
+        members,
+        str(target["eta"]),
+        f"{target['lambda_min']:.4g} .. {target['lambda_max']:.4g}",
+    )
+    for kind, bound, funnel in (("state", "delta", "rho"), ("input", "theta", "omega")):
+        for group in target[kind]:
+            share = group["start_share"]
+            yield (
+                *first,
+                f"{kind} {', '.join(group['components'])}",
+                f"{bound} {_span(group[bound])}",
+                f"{funnel} {_span(group[funnel])}",
+                "" if group[funnel]["rate"] is None else f"{group[funnel]['rate']:g}",
+                "unbounded: no" if share is None else f"{share:.3f}{'' if share < 1.0 else ': no'}",
+            )
+            first = ("", "", "", "")
+
+
+def _span(function: Mapping[str, float | None]) -> str:
+    return " -> ".join("?" if function[end] is None else f"{function[end]:.4g}" for end in ("initial", "final"))
+
+
+def _all_targets(targets: Sequence[Mapping[str, Any]]) -> str:
+    etas = [target["eta"] for target in targets]
+    shares = [group["start_share"] for target in targets for kind in ("state", "input") for group in target[kind]]
+    worst = "unbounded" if None in shares else f"{max(shares, default=0.0):.3f}"
+    return (
+        f"... and {len(targets) - SHOWN_TARGETS} more (--json has all). Over all {len(targets)}: eta {min(etas)} to "
+        f"{max(etas)}, lambda_min from {min(target['lambda_min'] for target in targets):.4g}, lambda_max to "
+        f"{max(target['lambda_max'] for target in targets):.4g}, start/funnel at most {worst}"
+    )

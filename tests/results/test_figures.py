@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from agents import make_law
+from khop_env.results import figures, paper_figure, record
+from khop_env.scenarios import paper
+from khop_env.scenarios.mixed_fleet import mixed_fleet
+
+
+def recorded(scenario, duration=0.5):
+    return record(scenario.build(law=make_law(scenario.law)).reset(0), duration, 0.01)
+
+
+def texts(recording, scenario, tmp_path, monkeypatch, **options) -> list[str]:
+    """All text in the three panels."""
+    from matplotlib.figure import Figure
+
+    kept = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kw: (kept.append(figure), save(figure, *args, **kw)))
+    paper_figure(recording, scenario, tmp_path / "figure.png", **options)
+    return [
+        text.get_text()
+        for axes in kept[0].axes
+        for text in (*axes.texts, axes.xaxis.label, axes.yaxis.label, axes.title, axes._left_title)
+    ]
+
+
+def test_the_file_shows_three_panels_in_colour(tmp_path):
+    scenario = paper()
+    path = paper_figure(recorded(scenario), scenario, tmp_path / "figure.png")
+    image = imread(path)[:, :, :3]
+    assert image.shape[0] > 400
+    assert image.shape[1] > 1200
+    for third in np.array_split(image, 3, axis=1):
+        assert (third < 0.99).any(axis=2).mean() > 0.01  # something is drawn
+        assert (np.ptp(third, axis=2) > 0.3).sum() > 500  # in colour
+
+
+def test_agent_4_of_the_paper_is_shown(tmp_path, monkeypatch):
+    scenario = paper()
+    found = texts(recorded(scenario), scenario, tmp_path, monkeypatch)
+    assert sum("drifter_3" in text for text in found) == 2
+    assert "time (s)" in found
+    assert "first coordinate (m)" in found
+    assert any(text.endswith("(m/s)") for text in found)
+    assert {str(i) for i in range(8)} <= set(found)  # agents named at their crosses
+
+
+def test_an_agent_without_an_input_observer_is_explained(tmp_path, monkeypatch):
+    scenario = mixed_fleet()
+    agent = scenario.fleet.agent("unicycle_0")
+    found = texts(recorded(scenario, 0.1), scenario, tmp_path, monkeypatch, agent=agent)
+    assert any("unicycle_0 has no input observer" in text for text in found)
+
+
+def test_components_with_different_bounds_are_named(tmp_path, monkeypatch):
+    scenario = mixed_fleet()
+    agent = scenario.fleet.agent("vessel_0")
+    found = texts(recorded(scenario, 0.1), scenario, tmp_path, monkeypatch, agent=agent)
+    assert any(text.partition(":")[0] in scenario.fleet.models[agent].states for text in found)
+
+
+def test_the_agent_most_observed_is_the_default():
+    scenario = mixed_fleet()
+    chosen = figures._default_agent(recorded(scenario, 0.05), scenario)
+    neighborhoods = scenario.design.neighborhoods
+    assert len(neighborhoods[chosen]) == max(map(len, neighborhoods))
+
+
+def test_pyplot_is_left_alone(tmp_path):
+    import subprocess
+    import sys
+
+    script = (
+        "import sys; from khop_env.scenarios import paper; from khop_env.results import record, paper_figure\n"
+        "from agents import make_law; s = paper(); r = record(s.build(law=make_law(s.law)), 0.02, 0.01)\n"
+        f"paper_figure(r, s, {str(tmp_path / 'f.png')!r}); assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_an_unknown_agent_is_refused(tmp_path):
+    scenario = paper()
+    with pytest.raises(ValueError, match="no agent 8"):
+        paper_figure(recorded(scenario, 0.02), scenario, tmp_path / "figure.png", agent=8)

@@ -1,0 +1,141 @@
+import json
+import math
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from khop_env.observers import Exponential, TargetObservers
+from khop_env.physics import AgentModel, SingleIntegrator
+from khop_env.results import design_report
+from khop_env.scenarios import Scenario, paper
+from khop_env.scenarios.mixed_fleet import mixed_fleet
+from khop_env.scenarios.random_geometric import random_geometric
+
+
+def path_of(agents: int = 4, **changes) -> Scenario:
+    graph = nx.path_graph(agents)
+    values = {
+        "name": "path",
+        "description": "",
+        "models": (SingleIntegrator(input_limit=4.0),) * agents,
+        "communication": graph,
+        "task": graph,
+        "k": 2,
+        "delta": Exponential(10.0, 0.1, 5.0),
+        "theta": Exponential(100.0, 1.0, 5.0),
+    }
+    return Scenario(**(values | changes))
+
+
+def assumption(report, number: str):
+    (found,) = [one for one in report["assumptions"] if one["number"] == number]
+    return found
+
+
+@pytest.mark.parametrize("make", [paper, mixed_fleet, random_geometric])
+def test_every_scenario_is_feasible_and_plain_json(make):
+    report = design_report(make())
+    assert report["feasible"] is True
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+    assert [one["number"] for one in report["assumptions"]] == ["1-i", "1-ii", "1-iii", "2", "3", "4", "5", "6"]
+    assert all(one["why"] for one in report["assumptions"])
+
+
+def test_agent_4_of_the_paper():
+    """lambda_min = (3 - sqrt 5) / 2, eta = 5 and rho(inf) = 0.02, omega's decay 39.27: the published constants."""
+    report = design_report(paper())
+    agent = report["targets"][3]
+    assert agent["agent"] == "drifter_3"
+    assert agent["k_hop"] == ["drifter_0", "drifter_1", "drifter_5", "drifter_6", "drifter_7"]
+    assert agent["eta"] == 5
+    assert agent["lambda_min"] == pytest.approx((3.0 - math.sqrt(5.0)) / 2.0)
+    (state,), (input_,) = agent["state"], agent["input"]
+    assert state["components"] == ["x1", "x2"]
+    assert state["delta"] == {"initial": pytest.approx(14.077), "final": 0.117, "rate": 5.0}
+    assert state["rho"]["final"] == pytest.approx(0.02, rel=1e-3)
+    assert input_["omega"]["initial"] - input_["omega"]["final"] == pytest.approx(39.27, rel=1e-3)
+    assert 0.0 < state["start_share"] < 1.0
+
+
+def test_step_bound_is_the_worst_targets():
+    scenario = paper()
+    report = design_report(scenario)
+    bounds = [0.5 * target["state"][0]["rho"]["final"] ** 2 / target["lambda_max"] for target in report["targets"]]
+    assert report["explicit_step_bound_s"]["state"] == pytest.approx(min(bounds))
+    assert report["explicit_step_bound_s"]["input"] > report["explicit_step_bound_s"]["state"]
+
+
+def test_components_with_different_bounds_stay_apart():
+    bound = {"integrator": (Exponential(10.0, 0.1, 5.0), Exponential(20.0, 0.2, 5.0))}
+    (x, y) = design_report(path_of(delta=bound))["targets"][0]["state"]
+    assert (x["components"], y["components"]) == (["x"], ["y"])
+    assert y["rho"]["final"] == pytest.approx(2.0 * x["rho"]["final"])
+    assert x["start_share"] == pytest.approx(2.0 * y["start_share"])
+
+
+def test_a_start_outside_the_funnel_is_told_with_the_number_that_would_do():
+    report = design_report(path_of(radius=50.0))
+    assert report["feasible"] is False
+    assert "take delta(0) above" in report["error"]
+    assert report["targets"][0]["state"][0]["start_share"] >= 1.0
+
+
+def test_a_design_that_is_impossible_is_reported_not_raised():
+    report = design_report(path_of(theta=None))
+    assert report["feasible"] is False
+    assert "theta is missing" in report["error"]
+    assert report["targets"] == []
+    json.dumps(report, allow_nan=False)
+
+
+def test_unbounded_inputs_are_infeasible_and_still_json():
+    report = design_report(path_of(models=(SingleIntegrator(input_limit=np.inf),) * 4))
+    assert report["feasible"] is False
+    assert report["targets"][0]["input"][0]["start_share"] is None
+    json.dumps(report, allow_nan=False)
+
+
+class TestAssumptions:
+    def test_disturbance_bound_is_told(self):
+        assert "|w| <= 0.3" in assumption(design_report(paper()), "1-iii")["why"]
+        assert assumption(design_report(path_of()), "1-iii")["why"] == "w = 0"
+
+    def test_relay(self):
+        assert assumption(design_report(path_of()), "4")["status"] == "holds by construction"
+        report = design_report(path_of(relay=False))
+        assert assumption(report, "4")["status"] == "doesn't hold"
+        assert report["feasible"] is True
+
+    def test_a_persistent_disturbance_is_no_error(self):
+        report = design_report(paper())
+        assert assumption(report, "5")["status"] == "doesn't hold"
+        assert report["feasible"] is True
+        assert assumption(design_report(path_of()), "5")["status"] == "holds"
+        assert assumption(design_report(paper().replace(disturbance=None)), "5")["status"] == "not known"
+
+    def test_locally_lipschitz_drift_is_told(self):
+        why = assumption(design_report(mixed_fleet()), "1-i")["why"]
+        assert "vessel: only locally Lipschitz" in why
+
+    def test_without_f_the_motion_has_to_be_bounded(self):
+        report = design_report(path_of(observers=(TargetObservers(drift=False),) * 4))
+        assert "Theorem 2" in assumption(report, "1-i")["why"]
+
+    def test_a_users_own_model_is_not_known(self):
+        class Rover(SingleIntegrator):
+            type = "rover"
+
+            def drift_lipschitz(self) -> float:
+                return AgentModel.drift_lipschitz(self)
+
+        report = design_report(path_of(models=(Rover(input_limit=4.0),) * 4))
+        assert assumption(report, "1-i")["status"] == "not known"
+        assert assumption(report, "1-ii")["status"] == "not known"
+
+    def test_steady_state_norm_is_over_all_pairs_and_components(self):
+        """Four agents in a row: each of the 4 pairs at distance 2 has two components of delta(inf) = 0.1."""
+        why = assumption(design_report(path_of()), "6")["why"]
+        assert f"{0.1 * math.sqrt(4 * 2):.4g}" in why
+        decay = math.log((10.0 - 0.1) / (0.05 * 0.1)) / 5.0  # all deltas are equal: 5 % above delta(inf)
+        assert f"t_x = {decay:.3g} s" in why

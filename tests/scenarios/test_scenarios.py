@@ -1,0 +1,116 @@
+"""The library's scenarios: what each promises, and the sizing of bounds."""
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from agents import make_law
+from khop_env.observers import Exponential
+from khop_env.physics import Sum, random_geometric_graph
+from khop_env.scenarios import mixed_fleet, paper, random_geometric
+
+
+def spread(simulator):
+    """|Pi p| of the positions."""
+    p = simulator.fleet.positions(simulator.x)[0]
+    return np.linalg.norm(p - p.mean(axis=0))
+
+
+def test_paper_has_the_published_numbers():
+    scenario = paper()
+    assert (len(scenario.fleet), scenario.k, scenario.fleet.n) == (8, 3, 16)
+    t = np.linspace(0.0, 3.0, 50)
+    np.testing.assert_allclose(scenario.delta(t), 13.96 * np.exp(-5 * t) + 0.117)
+    np.testing.assert_allclose(scenario.theta(t), 230 * np.exp(-5 * t) + 1.39)
+    layout = scenario.design.states.layout
+    agent_4 = 3
+    assert layout.plan[agent_4, 0] == 5
+    assert layout.eigenvalues[agent_4, 0] == pytest.approx((3 - np.sqrt(5)) / 2)
+    # 0.02 / 0.117 and 39.27 / 230, both published, are lambda_min(M_4) / sqrt(5) to their own rounding
+    gain = scenario.design.states.gain[2 * agent_4]
+    assert gain == pytest.approx(0.02 / 0.117, rel=1e-3)
+    assert gain == pytest.approx(39.27 / 230, rel=1e-3)
+
+
+def test_papers_task_mostly_joins_agents_out_of_earshot():
+    scenario = paper()
+    unheard = [edge for edge in scenario.task.edges if not scenario.communication.has_edge(*edge)]
+    assert len(unheard) > len(scenario.task.edges) / 2
+    assert nx.is_connected(scenario.task)
+
+
+@pytest.mark.parametrize("factory", [paper, mixed_fleet, lambda: random_geometric(agents=30)])
+def test_estimates_lead_the_team_together_and_keep_their_bounds(factory):
+    scenario = factory()
+    simulator = scenario.build(law=make_law(scenario.law))
+    before = spread(simulator)
+    for _ in range(round(scenario.duration / scenario.dt)):
+        simulator.step(scenario.dt)
+    assert spread(simulator) < 0.25 * before
+    for ratio in vars(simulator.extremes).values():
+        assert np.all(ratio < 1.0)
+
+
+def test_mixed_fleet_is_mixed():
+    scenario = mixed_fleet()
+    assert len(scenario.fleet) >= 10
+    assert len({model.n for model in scenario.models}) >= 3
+    assert isinstance(scenario.disturbance, Sum)
+    assert {type(term).__name__ for term in scenario.disturbance.terms} == {
+        "Sinusoid", "BandLimitedNoise", "Gust", "Coupling",
+    }  # fmt: skip
+    blind = scenario.build(law=make_law(scenario.law), observe="local")
+    seeing = scenario.build(law=make_law(scenario.law))
+    for _ in range(1500):
+        blind.step(scenario.dt)
+        seeing.step(scenario.dt)
+    assert spread(seeing) < 0.3 * spread(blind)
+
+
+def test_random_geometric_is_a_family():
+    one, same, other = (random_geometric(agents=25, k=2, seed=seed) for seed in (3, 3, 4))
+    assert set(one.communication.edges) == set(same.communication.edges) != set(other.communication.edges)
+    assert set(one.task.edges) == set(same.task.edges)
+    graph, _ = random_geometric_graph(25, 5.0, np.random.default_rng(3))
+    assert set(one.communication.edges) == set(graph.edges)
+    assert nx.is_connected(one.communication)
+    assert nx.is_connected(one.task)
+
+
+@pytest.mark.parametrize(("agents", "k"), [(4, 2), (5, 3), (40, 4)])
+def test_every_member_of_the_family_is_feasible(agents, k):
+    for seed in range(5):
+        scenario = random_geometric(agents=agents, k=k, seed=seed)
+        simulator = scenario.build(law=make_law(scenario.law))
+        simulator.step(0.01)
+        assert np.all(simulator.extremes.normalized < 1.0)
+
+
+def test_random_geometric_refuses_three_agents():
+    with pytest.raises(ValueError, match="at least 4 agents; got agents=3"):
+        random_geometric(agents=3)
+
+
+def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
+    scenario = paper().replace(delta=Exponential(1.0, 0.1, 5.0)).sized(margin=1.5)
+    share = scenario.design.states.feasible_at_start(scenario.initial.radius)
+    assert share.max() == pytest.approx(1 / 1.5)
+    assert (scenario.delta.final, scenario.delta.rate) == (0.1, 5.0)
+    with pytest.raises(ValueError, match="margin must exceed 1"):
+        scenario.sized(margin=1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"task": nx.Graph([(0, 7), *((i, i + 1) for i in range(7))])}, r"nobody could act.*\(0, 7\) at distance 5"),
+        ({"radius": np.ones(5)}, "radius must be one finite number or 16"),
+        ({"radius": -1.0}, "radius must not be negative"),
+        ({"dt": 0.0}, "dt must be positive"),
+        ({"communication": nx.path_graph(7)}, "missing 7"),
+        ({"delta": {"vesel": Exponential(1, 1, 1)}}, "delta is given for 'vesel'"),
+    ],
+)
+def test_a_scenario_that_does_not_fit_together_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        paper().replace(**changes).design  # noqa: B018

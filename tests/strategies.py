@@ -1,0 +1,221 @@
+"""What the tests draw: connected graphs, mixed fleets, funnels that their initial set fits into, and whole systems.
+
+The paper's definitions are written out here once more, from the graph alone (networkx), for tests to compare with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from hypothesis import strategies as st
+
+from khop_env.observers import Exponential, Funnels, ObserverDesign, PairLayout, TargetObservers
+from khop_env.physics import (
+    BandLimitedNoise,
+    Coupling,
+    DoubleIntegrator,
+    DriftingIntegrator,
+    Fleet,
+    Gust,
+    SingleIntegrator,
+    Sinusoid,
+    Sum,
+    SurfaceVessel,
+    Unicycle,
+)
+from khop_env.simulation import InitialSet, Integrator, Simulator, View
+
+SEEDS = st.integers(0, 2**32 - 1)
+PLANAR = (
+    SingleIntegrator(),
+    DriftingIntegrator(input_limit=3.0),
+    DoubleIntegrator(),
+    DoubleIntegrator(2.0, input_limit=4.0),
+    SurfaceVessel(),
+    Unicycle(),
+)
+OBSERVABLE_INPUT = tuple(model for model in PLANAR if not model.input_map_uses_state)
+
+
+# -- the paper's definitions, from the graph alone -----------------------------------------------------------------
+
+
+def k_hop_sets(graph: nx.Graph, k: int, relay: bool) -> list[set[int]]:
+    """N_i^{k-hop}: the agents at distance 2..k; from 1 on where Assumption 4 doesn't hold (remark after Lemma 1)."""
+    distance = dict(nx.all_pairs_shortest_path_length(graph))
+    nearest = 2 if relay else 1
+    return [{j for j in graph if nearest <= distance[i][j] <= k} for i in sorted(graph)]
+
+
+def relays(graph: nx.Graph, observer: int, target: int, relay: bool) -> int:
+    """The diagonal of H_i: |N_a cap N_i|, or without relay whether a is a neighbour of i."""
+    if relay:
+        return len(set(graph[observer]) & set(graph[target]))
+    return int(graph.has_edge(observer, target))
+
+
+def definition_of_m(graph: nx.Graph, members: list[int], target: int, relay: bool) -> np.ndarray:
+    """M_i = L_i + H_i over `members`, the k-hop neighbours of the target in the order wanted."""
+    laplacian = nx.laplacian_matrix(graph.subgraph(members), nodelist=members).toarray().astype(float)
+    return laplacian + np.diag([float(relays(graph, member, target, relay)) for member in members])
+
+
+def observers_of(layout: PairLayout, index: int) -> list[int]:
+    """The agents that estimate `layout.target[index]`, in the layout's order."""
+    eta, *_, pair = layout.plan[index].tolist()
+    return layout.observer[pair : pair + eta].tolist()
+
+
+# -- strategies ----------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def connected_graphs(draw: st.DrawFn, smallest: int = 3, largest: int = 9) -> nx.Graph:
+    """A random tree, each agent joined to an earlier one, and up to N more edges."""
+    agents = draw(st.integers(smallest, largest))
+    graph = nx.Graph()
+    graph.add_nodes_from(range(agents))
+    graph.add_edges_from((draw(st.integers(0, i - 1)), i) for i in range(1, agents))
+    ends = st.tuples(st.integers(0, agents - 1), st.integers(0, agents - 1))
+    graph.add_edges_from((i, j) for i, j in draw(st.lists(ends, max_size=agents)) if i != j)
+    return graph
+
+
+@st.composite
+def hops(draw: st.DrawFn, relay: bool | None = None) -> tuple[int, bool]:
+    """k and whether neighbours relay; all k that leave something to estimate."""
+    relay = draw(st.booleans()) if relay is None else relay
+    return draw(st.integers(2 if relay else 1, 4)), relay
+
+
+def exponentials(smallest: float = 1e-3, largest: float = 1e3) -> st.SearchStrategy[Exponential]:
+    """Decreasing exponential performance functions."""
+    sizes = st.floats(np.log(smallest), np.log(largest)).map(np.exp)
+    return st.builds(lambda a, b, rate: Exponential(max(a, b), min(a, b), rate), sizes, sizes, st.floats(0.05, 20.0))
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A fleet, its observers and disturbances, and where it starts.
+
+    Attributes:
+        design: observers whose funnels hold the whole initial set.
+        initial: that set.
+        disturbance: what acts on the agents.
+        task: pairs of agents within k hops.
+        deltas: per target the bounds that the design was given, one per component.
+        thetas: likewise for inputs.
+        seed: for whatever else a test draws.
+    """
+
+    design: ObserverDesign
+    initial: InitialSet
+    disturbance: Sum
+    task: nx.Graph
+    deltas: dict[int, list[Exponential]]
+    thetas: dict[int, list[Exponential]]
+    seed: int
+
+    def simulator(self, integrator: Integrator, batch: int = 1, **options: object) -> Simulator:
+        """A simulator of this system, reset with its seed."""
+        simulator = Simulator(
+            self.design,
+            self.initial,
+            disturbance=self.disturbance,
+            task=self.task,
+            integrator=integrator,
+            batch=batch,
+            **options,
+        )
+        return simulator.reset(self.seed)
+
+
+def fitting(
+    funnels: Funnels, radius: np.ndarray, rng: np.random.Generator, floor: float, margin: float
+) -> dict[int, list[Exponential]]:
+    """Per target one bound a component: `margin` to 5 times the smallest feasible delta(0), decaying to `floor` or above."""
+    smallest = np.maximum(funnels.smallest_initial_bound(radius), 2.0 * floor)
+    bounds: dict[int, list[Exponential]] = {}
+    for target, (_, n, _, _, row, _) in zip(funnels.layout.target.tolist(), funnels.layout.plan.tolist(), strict=True):
+        initial = smallest[row : row + n] * np.exp(rng.uniform(np.log(margin), np.log(5.0), n))
+        final = initial * np.exp(rng.uniform(np.log(floor / initial), 0.0))
+        bounds[target] = [Exponential(a, b, rng.uniform(0.2, 8.0)) for a, b in zip(initial, final, strict=True)]
+    return bounds
+
+
+@st.composite
+def systems(
+    draw: st.DrawFn,
+    *,
+    models: tuple = PLANAR,
+    relay: bool | None = None,
+    drift: bool | None = None,
+    input_observer: bool | None = None,
+    floor: float = 0.02,
+    margin: float = 1.05,
+    largest: int = 9,
+) -> System:
+    """A whole random system.
+
+    Args:
+        draw: Hypothesis.
+        models: what the fleet is mixed from.
+        relay: whether Assumption 4 holds; drawn if left out.
+        drift: whether the observers know f_i; drawn agent by agent if left out.
+        input_observer: whether there are input observers, where they can be; drawn agent by agent if left out.
+        floor: the smallest bound on an estimation error at steady state.
+        margin: how much larger than the smallest feasible one the bounds start, at least.
+        largest: number of agents at most.
+    """
+    graph = draw(connected_graphs(largest=largest))
+    k, relay = draw(hops(relay))
+    agents = len(graph)
+    fleet = Fleet([draw(st.sampled_from(models)) for _ in range(agents)])
+    options = [
+        TargetObservers(
+            drift=draw(st.booleans()) if drift is None else drift,
+            input_observer=not model.input_map_uses_state
+            and (draw(st.booleans()) if input_observer is None else input_observer),
+        )
+        for model in fleet.models
+    ]
+    seed = draw(SEEDS)
+    rng = np.random.default_rng(seed)
+    initial = InitialSet(rng.uniform(-2.0, 2.0, fleet.n), rng.uniform(0.0, 1.5, fleet.n))
+    anything = Exponential(1.0, 1.0, 1.0)
+    probe = ObserverDesign(fleet, graph, k, anything, anything, relay, options)
+    deltas = fitting(probe.states, initial.radius, rng, floor, margin)
+    thetas = fitting(probe.inputs, fleet.input_map_bound, rng, 5.0 * floor, margin)
+    design = ObserverDesign(fleet, graph, k, deltas, thetas, relay, options)
+    disturbance = Sum(
+        (
+            Sinusoid(rng.uniform(0.0, 0.5)),
+            BandLimitedNoise(rng.uniform(0.0, 0.5), band=(0.5, 20.0), components=3),
+            Gust(rng.uniform(0.0, 0.5), duration=0.2, period=0.5),
+            Coupling(rng.uniform(0.0, 0.5)),
+        )
+    )
+    within = dict(nx.all_pairs_shortest_path_length(graph, k))
+    pairs = [(i, j) for i in range(agents) for j in range(i) if j in within[i]]
+    task = nx.empty_graph(agents)
+    task.add_edges_from(pairs[p] for p in rng.permutation(len(pairs))[: agents + 1])
+    return System(design, initial, disturbance, task, deltas, thetas, seed)
+
+
+class SmoothSignals:
+    """Inputs that are sines of time within the limits: bounded derivatives, so Assumption 2-ii holds.
+
+    Args:
+        fleet: whose inputs.
+        seed: of amplitudes, frequencies and phases.
+    """
+
+    def __init__(self, fleet: Fleet, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.amplitude = rng.uniform(0.0, 1.0, fleet.m) * fleet.input_limit
+        self.frequency, self.phase = rng.uniform(0.1, 8.0, fleet.m), rng.uniform(0.0, 7.0, fleet.m)
+
+    def __call__(self, t: np.ndarray, view: View) -> np.ndarray:
+        return self.amplitude * np.sin(self.frequency * t[:, None] + self.phase)

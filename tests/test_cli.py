@@ -1,0 +1,272 @@
+import json
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+import khop_env
+from khop_env import __version__, terminal
+from khop_env.cli import app
+
+
+def khop(*arguments: str, status: int = 0):
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code == status, (result.stdout, result.stderr, result.exception)
+    return result
+
+
+def only_json(result):
+    """Stdout is one JSON object and nothing else."""
+    value = json.loads(result.stdout)
+    assert isinstance(value, dict)
+    return value
+
+
+def refused(*arguments: str) -> str:
+    """The one paragraph on stderr, with nothing on stdout."""
+    result = khop(*arguments, status=2)
+    assert result.stdout == ""
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("khop_env: compiling")]
+    assert len(lines) == 1
+    assert lines[0].startswith("khop: ")
+    return lines[0]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class TestList:
+    def test_table(self):
+        found = khop("list").stdout
+        for name in ("paper", "mixed_fleet", "random_geometric", "agents=100"):
+            assert name in found
+
+    def test_json(self):
+        found = only_json(khop("list", "--json"))["scenarios"]
+        assert [one["name"] for one in found] == ["paper", "mixed_fleet", "random_geometric"]
+
+
+class TestCheck:
+    def test_table(self):
+        found = khop("check", "paper").stdout
+        for part in ("drifter_3", "0.382 .. 2.618", "rho 2.405 -> 0.01999", "holds by construction", "feasible: every"):
+            assert part in found
+        assert "3.29e-05 s (state observers)" in found
+
+    def test_json(self):
+        result = khop("check", "paper", "--json")
+        assert only_json(result)["feasible"] is True
+
+    def test_a_large_fleet_is_cut_short(self):
+        found = khop("check", "random_geometric:agents=60").stdout
+        assert "and 40 more (--json has all). Over all 60: eta" in found
+        report = only_json(khop("check", "random_geometric:agents=60", "--json"))
+        assert len(report["targets"]) == 60
+
+    @pytest.mark.parametrize("options", [[], ["--json"]])
+    def test_infeasible(self, folder, options):
+        text = khop("export", "paper").stdout.replace("initial_radius = 1.5", "initial_radius = 5.0")
+        (folder / "wide.toml").write_text(text)
+        result = khop("check", "wide.toml", *options, status=1)
+        assert "take delta(0) above" in result.stdout
+        if options:
+            assert only_json(result)["feasible"] is False
+
+    def test_a_design_that_is_impossible(self, folder):
+        text = khop("export", "paper").stdout
+        start, stop = text.index("[theta]"), text.index("# Disturbances")
+        (folder / "bare.toml").write_text(text[:start] + text[stop:])
+        assert "not feasible: theta is missing" in khop("check", "bare.toml", status=1).stdout
+        assert "theta is missing" in refused("run", "bare.toml")
+
+
+class TestRun:
+    def test_everything_is_written(self, folder):
+        result = khop("run", "paper", "--duration", "0.5", "--seed", "3")
+        out = folder / "runs" / "paper"
+        assert sorted(path.name for path in out.iterdir()) == [
+            "estimates.parquet",
+            "figure.png",
+            "states.parquet",
+            "summary.json",
+        ]
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["seed"] == 3
+        assert summary["duration"] == 0.5
+        assert (summary["dt"], summary["integrator"], summary["order"]) == (0.01, "proximal", 2)
+        assert summary["funnel_kept"] is True
+        assert "guarantee kept" in result.stdout
+        assert f"{summary['max_normalized_disagreement']:.3f}" in result.stdout
+        assert f"{summary['max_error_to_bound_input']:.3f}" in result.stdout
+        assert "figure: runs/paper/figure.png" in result.stdout
+        estimates = pl.read_parquet(out / "estimates.parquet")
+        assert estimates["time"].n_unique() == 51
+        assert (estimates["error"] - (estimates["estimate"] - estimates["state"])).abs().max() == 0.0
+        assert (estimates["disagreement"].abs() / estimates["rho"]).max() < 1.0
+        assert pl.read_parquet(out / "states.parquet").columns == ["time", "agent", "component", "x", "u"]
+        assert (out / "figure.png").stat().st_size > 20_000
+
+    def test_json(self, folder):
+        result = khop("run", "paper", "--duration", "0.1", "--json", "--out", "here")
+        found = only_json(result)
+        files = found.pop("files")
+        assert found == json.loads((folder / "here" / "summary.json").read_text())
+        assert files["figure"] == "here/figure.png"
+
+    def test_same_seed_same_bits(self, folder):
+        for out, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+            khop("run", "mixed_fleet", "--duration", "0.1", "--seed", seed, "--out", out)
+        a, b, c = (pl.read_parquet(f"{out}/estimates.parquet") for out in "abc")
+        assert a.equals(b)
+        assert not a.equals(c)
+
+    def test_options(self, folder):
+        options = [
+            "--controller",
+            "tanh",
+            "--observe",
+            "local",
+            "--dt",
+            "0.05",
+            "--order",
+            "1",
+            "--integrator",
+            "proximal",
+        ]
+        found = only_json(khop("run", "paper", "--duration", "0.2", *options, "--json"))
+        assert (found["observe"], found["dt"], found["order"], found["steps"]) == ("local", 0.05, 1, 4)
+        assert found["controller"] == "tanh"
+
+    def test_observe_changes_what_the_law_sees(self, folder):
+        errors = {
+            observe: only_json(khop("run", "paper", "--duration", "1", "--observe", observe, "--json"))[
+                "final_consensus_error"
+            ]
+            for observe in ("estimate", "oracle", "local")
+        }
+        assert len(set(errors.values())) == 3
+        assert errors["local"] > errors["oracle"]
+
+    def test_explicit_steps_as_the_paper_samples(self, folder):
+        found = only_json(khop("run", "paper", "--integrator", "explicit", "--duration", "0.002", "--json"))
+        assert (found["integrator"], found["order"], found["dt"], found["steps"]) == ("explicit", 1, 1e-5, 200)
+
+    def test_leaving_the_funnel_loses_nothing(self, folder):
+        arguments = ["run", "paper", "--integrator", "explicit", "--dt", "1e-3", "--out", "lost"]
+        result = khop(*arguments, status=1)
+        assert "the explicit step left the funnel" in result.stderr
+        assert "would have been stable" in result.stderr
+        assert "guarantee not kept: stopped at t = 0." in result.stdout
+        assert len(list((folder / "lost").iterdir())) == 4
+        assert pl.read_parquet("lost/estimates.parquet")["time"].max() > 0.1
+        found = only_json(khop(*arguments, "--json", status=1))
+        assert found["funnel_kept"] is False
+        assert "left the funnel" in found["error"]
+
+    def test_refusals(self, folder):
+        assert "no scenario 'papr'; did you mean 'paper'?" in refused("run", "papr")
+        assert "no law 'tan'; did you mean 'tanh'?" in refused("run", "paper", "--controller", "tan")
+        assert "--dt must be positive and finite; got 0.0" in refused("run", "paper", "--dt", "0")
+        assert "--duration must be positive" in refused("run", "paper", "--duration", "-1")
+        assert "forward Euler" in refused("run", "paper", "--integrator", "explicit", "--order", "2")
+        assert "can't be read" in refused("run", "nowhere.toml")
+        (folder / "taken").write_text("a file")
+        assert "taken" in refused("run", "paper", "--out", "taken")
+        for option, value in (("--observe", "all"), ("--integrator", "rk4"), ("--order", "3"), ("--seed", "-1")):
+            result = khop("run", "paper", option, value, status=2)
+            assert result.stdout == ""
+            assert "Traceback" not in result.stderr
+
+
+class TestExport:
+    def test_a_file_to_start_from(self, folder):
+        (folder / "mine.toml").write_text(khop("export", "paper").stdout)
+        ours = only_json(khop("run", "paper", "--duration", "0.2", "--json", "--out", "a"))
+        theirs = only_json(khop("run", "mine.toml", "--duration", "0.2", "--json", "--out", "b"))
+        assert ours["max_normalized_disagreement"] == theirs["max_normalized_disagreement"]
+        assert pl.read_parquet("a/estimates.parquet").equals(pl.read_parquet("b/estimates.parquet"))
+
+    @pytest.mark.parametrize(
+        ("old", "new", "said"),
+        [
+            ('name = "tanh"', 'name = "tan"', "law.name: got 'tan', expected one of 'tanh'; did you mean 'tanh'?"),
+            ("gain = 2.0", "gian = 2.0", "mine.toml: law: law 'tanh' doesn't take"),
+            ("gain = 2.0", "gain = -2.0", "mine.toml: law: the gain of the tanh law must be positive"),
+        ],
+    )
+    def test_a_law_that_is_wrong(self, folder, old, new, said):
+        text = khop("export", "paper").stdout
+        assert old in text
+        (folder / "mine.toml").write_text(text.replace(old, new))
+        assert said in refused("run", "mine.toml")
+
+
+class TestBench:
+    @pytest.fixture(autouse=True)
+    def stand_in(self, monkeypatch):
+        def benchmark(quick=False, progress=None):
+            progress("measuring")
+            rows = [{"name": "speedup", "value": 61.234567, "unit": "x", "target": ">= 60"}]
+            return {"rows": rows, "machine": "here", "quick": quick}
+
+        module = types.ModuleType("khop_env.bench")
+        module.benchmark = benchmark
+        monkeypatch.setitem(sys.modules, "khop_env.bench", module)
+
+    def test_table(self):
+        result = khop("bench")
+        assert "speedup" in result.stdout
+        assert "61.23" in result.stdout
+        assert result.stderr == "measuring\n"
+
+    def test_json(self):
+        assert only_json(khop("bench", "--json", "--quick"))["quick"] is True
+
+
+class TestProgress:
+    @pytest.fixture
+    def clock(self, monkeypatch):
+        now = [0.0]
+        monkeypatch.setattr(terminal.time, "perf_counter", lambda: now[0])
+        return now
+
+    def test_short_work_shows_no_bar(self, clock):
+        with terminal.Progress("work") as progress:
+            clock[0] = 1.0
+            progress(0.6)
+            assert progress._bar is None
+
+    def test_long_work_shows_one_early(self, clock):
+        with terminal.Progress("work") as progress:
+            clock[0] = 0.4
+            progress(0.001)
+            assert progress._bar is None
+            clock[0] = 0.6
+            progress(0.1)
+            assert progress._bar is not None
+
+
+def test_version():
+    assert khop("--version").stdout == f"{__version__}\n"
+
+
+def test_help_names_every_command():
+    found = khop("--help").stdout
+    for command in ("list", "check", "run", "export", "bench"):
+        assert command in found
+
+
+def test_as_a_module_in_a_process_of_its_own(tmp_path):
+    command = [sys.executable, "-m", "khop_env", "run", "paper", "--duration", "0.1", "--json"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(khop_env.__file__).parents[1])}
+    found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert json.loads(found.stdout)["funnel_kept"] is True
+    assert (tmp_path / "runs" / "paper" / "figure.png").exists()

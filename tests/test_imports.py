@@ -1,0 +1,133 @@
+"""The rooms of the architecture and who may enter them: imports go one way, and heavy packages come in on demand."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# One line a rank; nothing imports from a later line. A new module has to be put in its place here.
+RANKS = [
+    ["khop_env.compiled"],
+    ["khop_env.elementary"],
+    ["khop_env.physics"],
+    ["khop_env.observers"],
+    ["khop_env.simulation"],
+    ["khop_env.env"],
+    ["khop_env.scenarios"],
+    ["khop_env.registry", "khop_env.consensus_v0", "khop_env.formation_v0", "khop_env.leader_following_v0"],
+    ["khop_env.results"],
+    ["agents"],
+    ["khop_env.bench"],
+    ["khop_env.terminal"],
+    ["khop_env.cli", "khop_env.__main__"],
+]
+# Where a third-party package may be imported at all (architecture, last paragraph of the import order).
+HEAVY = {
+    "torch": ("agents",),
+    "ray": ("agents",),
+    "stable_baselines3": ("agents", "khop_env.env.sb3"),
+    "matplotlib": ("khop_env.results", "khop_env.env.rendering"),
+}
+NOT_ON_IMPORT = ("matplotlib", "torch", "ray", "stable_baselines3", "polars", "rich", "scipy", "numba")
+
+
+def modules() -> dict[str, Path]:
+    """All modules of both packages by name."""
+    found = {}
+    for package in ("khop_env", "agents"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+def rank(module: str) -> int:
+    """The line of RANKS that a module belongs to."""
+    for number, names in enumerate(RANKS):
+        if any(module == name or module.startswith(name + ".") for name in names):
+            return number
+    raise LookupError(f"{module} has no place in the architecture: add it to RANKS in tests/test_imports.py")
+
+
+def imports(module: str) -> list[tuple[int, str]]:
+    """(line, imported module) of every import statement in a module, in functions and under TYPE_CHECKING too.
+
+    What is read as an attribute of `khop_env` itself counts as an import, since the package fetches it on demand.
+    """
+    path = MODULES[module]
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names if alias.name != "khop_env"]
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "khop_env":
+            found.append((node.lineno, f"khop_env.{node.attr}"))
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parent = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*parent, *([node.module] if node.module else [])])
+            for alias in node.names:  # `from package import module` imports the module
+                whole = f"{base}.{alias.name}"
+                found.append((node.lineno, whole if whole in MODULES or base == "khop_env" else base))
+    return found
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name != "khop_env"])
+def test_nothing_imports_to_its_right(module: str) -> None:
+    """physics < observers < simulation < env < scenarios < registry and *_v0 < results < agents < bench < cli."""
+    wrong = [
+        f"line {line}: {module} imports {other}"
+        for line, other in imports(module)
+        if other.split(".")[0] in ("khop_env", "agents")
+        and other != "khop_env.__version__"
+        and rank(other) > rank(module)
+    ]
+    assert not wrong, wrong
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_heavy_packages_are_imported_in_their_rooms_only(module: str) -> None:
+    """torch and ray in agents, stable_baselines3 there and in env/sb3.py, matplotlib in results and env/rendering.py."""
+    for line, other in imports(module):
+        rooms = HEAVY.get(other.split(".")[0], (module,))
+        assert any(module == room or module.startswith(room + ".") for room in rooms), f"line {line} imports {other}"
+
+
+def test_ranks_name_existing_rooms_in_the_architecture_s_order() -> None:
+    """The list above is the one of architecture.md: a typing error in it would make the test pass for nothing."""
+    names = [name for names in RANKS for name in names]
+    assert len(set(names)) == len(names)
+    for name in MODULES:
+        assert name == "khop_env" or rank(name) >= 0
+    assert rank("khop_env.physics.graph") < rank("khop_env.observers") < rank("khop_env.simulation.proximal")
+    assert rank("khop_env.scenarios.paper") < rank("agents.laws") < rank("khop_env.cli")
+
+
+def loaded_by(statement: str) -> list[str]:
+    """Top-level packages in sys.modules after a statement in a fresh interpreter."""
+    code = f"import sys; {statement}; print(*sorted({{name.split('.')[0] for name in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_import_khop_env_is_light() -> None:
+    """No plotting, learning, table or compiling package, so that `import khop_env` is quick and works without them."""
+    loaded = loaded_by("import khop_env; khop_env.__version__")
+    assert "khop_env" in loaded
+    assert not set(NOT_ON_IMPORT) & set(loaded)
+
+
+@pytest.mark.parametrize(
+    "statement", ["import khop_env.scenarios", "import agents", "import khop_env.simulation, khop_env.observers"]
+)
+def test_the_core_needs_no_extra(statement: str) -> None:
+    """Building and running a scenario needs NumPy, networkx and Numba; what is heavy stays out until it is asked for."""
+    assert not (set(NOT_ON_IMPORT) - {"numba", "scipy"}) & set(loaded_by(statement))

@@ -1,0 +1,26 @@
+"""What the README shows runs, and so do the examples."""
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_readmes_python_runs(capsys):
+    (snippet,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    exec(compile(snippet, "README.md", "exec"), {})
+    assert "largest |xi| / rho: 0." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.name)
+def test_example_runs(path, capsys):
+    runpy.run_path(str(path), run_name="__main__")
+    assert capsys.readouterr().out
+
+
+def test_ci_calls_the_readmes_test_command():
+    assert "\nmake test" in (ROOT / "README.md").read_text()
+    assert "\nmake test" in (ROOT / ".ci" / "run").read_text()

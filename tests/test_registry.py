@@ -1,0 +1,102 @@
+import importlib
+import pkgutil
+import re
+import subprocess
+import sys
+
+import pytest
+
+import khop_env
+import khop_env.scenarios
+from khop_env.registry import SCENARIOS, describe, scenario, scenarios
+from khop_env.scenarios import Scenario
+from khop_env.scenarios.files import ScenarioFileError, write_scenario
+
+
+def test_the_registry_equals_the_files():
+    found = set()
+    for module in pkgutil.iter_modules(khop_env.scenarios.__path__):
+        content = importlib.import_module(f"khop_env.scenarios.{module.name}")
+        if callable(getattr(content, module.name, None)):
+            found.add(module.name)
+    assert set(SCENARIOS) == found
+    assert set(SCENARIOS) == {"paper", "mixed_fleet", "random_geometric"}
+    assert scenarios() == tuple(SCENARIOS)
+
+
+@pytest.mark.parametrize("name", scenarios())
+def test_every_scenario_is_complete(name):
+    made = scenario(name)
+    assert isinstance(made, Scenario)
+    assert made.name == name
+    assert made.description
+    assert "\n" not in made.description
+    assert made.design.states.layout.pairs > 0
+
+
+def test_descriptions():
+    assert [one["name"] for one in describe()] == list(scenarios())
+    assert all(one["description"] for one in describe())
+    assert describe()[-1]["parameters"] == {"agents": 100, "k": 2, "seed": 0}
+
+
+def test_parameters_of_a_family():
+    by_text = scenario("random_geometric:agents=12, k=3,seed=4")
+    by_keyword = scenario("random_geometric", agents=12, k=3, seed=4)
+    assert len(by_text.models) == 12
+    assert by_text.k == 3
+    assert by_text.communication.edges == by_keyword.communication.edges
+    assert len(scenario("random_geometric:agents=12", agents=8).models) == 8  # keywords win
+    assert len(scenario("random_geometric:").models) == 100
+
+
+def test_a_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(write_scenario(scenario("paper").replace(name="mine")))
+    assert scenario(path).name == "mine"
+    assert scenario(str(path)).name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "said"),
+    [
+        ("papr", {}, "no scenario 'papr'; did you mean 'paper'?"),
+        ("zzz", {}, "known: paper, mixed_fleet, random_geometric"),
+        ("random_geometric:agnts=3", {}, "no parameter 'agnts'; did you mean 'agents'?"),
+        ("random_geometric", {"agnts": 3}, "no parameter 'agnts'; did you mean 'agents'?"),
+        ("random_geometric:agents=many", {}, "agents must be of type int; got 'many'"),
+        ("random_geometric:agents", {}, "expected parameter=value after the colon; got 'agents'"),
+        ("random_geometric:agents=3", {}, "at least 4 agents; got agents=3"),
+        ("paper:k=2", {}, "scenario 'paper' has no parameter 'k'; it has none"),
+        ("mine.toml", {"k": 2}, "a scenario file takes no parameters; got k"),
+    ],
+)
+def test_refusals(name, parameters, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        scenario(name, **parameters)
+
+
+def test_a_missing_file():
+    with pytest.raises(ScenarioFileError, match="can't be read"):
+        scenario("nowhere.toml")
+
+
+def test_the_package_exports_lazily():
+    assert khop_env.scenario is scenario
+    assert set(khop_env.__all__) <= set(dir(khop_env))
+    with pytest.raises(AttributeError, match="no attribute 'scenaria'"):
+        khop_env.scenaria  # noqa: B018
+
+
+def test_heavy_imports_wait():
+    script = """
+import sys
+import khop_env
+heavy = {"numpy", "numba", "polars", "matplotlib", "rich", "typer", "tomlkit", "networkx"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+khop_env.scenario("paper")
+import khop_env.results, khop_env.cli, khop_env.registry
+late = {"polars", "matplotlib", "tomlkit"}
+assert not late & set(sys.modules), late & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
