@@ -28,7 +28,10 @@ def test_the_registry_equals_the_files():
 def test_every_scenario_is_complete(name):
     made = scenario(name)
     assert isinstance(made, Scenario)
-    assert made.name == name
+    assert made.name.partition(":")[0] == name
+    again = scenario(made.name)  # a name says how to make it
+    assert again.name == made.name
+    assert set(again.task.edges) == set(made.task.edges)
     assert made.description
     assert "\n" not in made.description
     assert made.design.states.layout.pairs > 0
