@@ -135,7 +135,9 @@ class System:
 def fitting(
     funnels: Funnels, radius: np.ndarray, rng: np.random.Generator, floor: float, margin: float
 ) -> dict[int, list[Exponential]]:
-    """Per target one bound a component: `margin` to 5 times the smallest feasible delta(0), decaying to `floor` or above."""
+    """Per target one bound a component: `margin` to 5 times the smallest feasible delta(0), decaying to `floor` or
+    above.
+    """
     smallest = np.maximum(funnels.smallest_initial_bound(radius), 2.0 * floor)
     bounds: dict[int, list[Exponential]] = {}
     for target, (_, n, _, _, row, _) in zip(funnels.layout.target.tolist(), funnels.layout.plan.tolist(), strict=True):

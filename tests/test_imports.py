@@ -95,7 +95,7 @@ def test_nothing_imports_to_its_right(module: str) -> None:
 
 @pytest.mark.parametrize("module", MODULES)
 def test_heavy_packages_are_imported_in_their_rooms_only(module: str) -> None:
-    """torch and ray in agents, stable_baselines3 there and in env/sb3.py, matplotlib in results and env/rendering.py."""
+    """torch, ray in agents; stable_baselines3 there and in env/sb3.py; matplotlib in results and env/rendering.py."""
     for line, other in imports(module):
         rooms = HEAVY.get(other.split(".")[0], (module,))
         assert any(module == room or module.startswith(room + ".") for room in rooms), f"line {line} imports {other}"
@@ -129,5 +129,5 @@ def test_import_khop_env_is_light() -> None:
     "statement", ["import khop_env.scenarios", "import agents", "import khop_env.simulation, khop_env.observers"]
 )
 def test_the_core_needs_no_extra(statement: str) -> None:
-    """Building and running a scenario needs NumPy, networkx and Numba; what is heavy stays out until it is asked for."""
+    """Building and running a scenario needs NumPy, networkx and Numba; heavy ones stay out until they are asked for."""
     assert not (set(NOT_ON_IMPORT) - {"numba", "scipy"}) & set(loaded_by(statement))

@@ -22,7 +22,10 @@ from khop_env.observers.performance import FunnelBank, PerformanceFunction, scal
 from khop_env.physics import Fleet, k_hop_neighbors, validate_graph
 
 Bound = PerformanceFunction | Sequence[PerformanceFunction]
-"""A bound on a target's estimation error: one function for all its components, or one for each."""
+"""A bound on a target's estimation error: one function for all its components, or one for each.
+
+All observers of a target share it; bounds that differ between observers go through `lower_bound` first.
+"""
 
 
 class DesignError(ValueError):
@@ -202,6 +205,10 @@ class ObserverDesign:
             if isinstance(bounds, Mapping) and int(i) not in bounds:
                 raise DesignError(f"{name} has no bound for agent {self.fleet.ids[i]!r}; give one per target")
             bound = bounds[int(i)] if isinstance(bounds, Mapping) else bounds
+            if isinstance(bound, type):
+                raise DesignError(
+                    f"{name}: expected an instance, got the class {bound.__name__}; write {bound.__name__}(...)"
+                )
             several = list(bound) if isinstance(bound, Sequence) else [bound] * int(n)
             if len(several) != n or not all(isinstance(one, PerformanceFunction) for one in several):
                 raise DesignError(

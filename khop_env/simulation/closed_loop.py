@@ -60,7 +60,7 @@ class ClosedLoop:
             return
         assert self.views is not None
         u = self.law(t, self.views.update(x, estimate))
-        if u.shape != (self.batch, self.fleet.m):
+        if np.shape(u) != (self.batch, self.fleet.m):
             raise ValueError(
                 f"law {self.law!r} returned inputs of shape {np.shape(u)}; expected (environments, inputs) = "
                 f"{(self.batch, self.fleet.m)}"

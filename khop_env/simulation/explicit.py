@@ -10,6 +10,7 @@ import numpy as np
 from khop_env.observers import FloatArray, Funnels
 from khop_env.observers.disagreement import correction, disagreement, largest_curvature
 from khop_env.simulation.closed_loop import ClosedLoop
+from khop_env.simulation.integrators import require_finite
 from khop_env.simulation.state import SimulatorState
 
 
@@ -83,19 +84,39 @@ class Explicit:
         """Advance by `dt` seconds, in place.
 
         Raises:
-            FunnelError: if a disagreement leaves its funnel; the state is then the last one inside.
+            FunnelError: if a disagreement leaves its funnel, or a jump had put it outside; the state is the one before.
+            SolveError: if a state isn't finite; likewise.
         """
         loop = self._loop
         loop.rho.evaluate(state.t, self._rho)
         loop.omega.evaluate(state.t, self._omega)
         dy, dghat, e, q = self._derivative(state, self._rho, self._omega)
+        for kind, funnels, normalized in (("state", loop.design.states, e), ("input", loop.design.inputs, q)):
+            if not np.all(np.abs(normalized) < 1.0):
+                who, ratio = _worst(loop, funnels, np.abs(normalized))
+                raise FunnelError(
+                    f"the {kind} observer of {who} is outside its funnel before the step, at {ratio:.4g} times its "
+                    f"width: the {'state' if kind == 'state' else 'input (Assumption 2-ii)'} jumped. No explicit step "
+                    "can go on from there; the proximal integrator can"
+                )
         before = state.copy()
-        loop.plant(state.t, state.x, state.g, state.drawn, self._dx)
-        state.x += dt * self._dx
-        state.estimate += dt * dy
-        state.input_estimate += dt * dghat
-        state.t += dt
-        self.start(state)
+        try:
+            loop.plant(state.t, state.x, state.g, state.drawn, self._dx)
+            state.x += dt * self._dx
+            state.estimate += dt * dy
+            state.input_estimate += dt * dghat
+            state.t += dt
+            require_finite(state.x, loop.fleet)
+            self.start(state)
+            self._require_inside(state, float(dt), before, e, q)
+        except BaseException:
+            state.assign(before)
+            raise
+
+    def _require_inside(
+        self, state: SimulatorState, dt: float, before: SimulatorState, e: FloatArray, q: FloatArray
+    ) -> None:
+        loop = self._loop
         for kind, funnels, bank, funnel, estimate, source, xi, e_before in (
             ("state", loop.design.states, loop.rho, self._rho, state.estimate, state.x, self._xi[0], e),
             ("input", loop.design.inputs, loop.omega, self._omega, state.input_estimate, state.g, self._xi[1], q),
@@ -105,9 +126,16 @@ class Explicit:
             disagreement(*funnels.layout.arrays, estimate, source, xi)
             ratio = np.abs(xi) / funnel[funnels.layout.column_row]
             if not np.all(ratio < 1.0):
-                message = _left_funnel(loop, kind, funnels, ratio, e_before, funnel_before, float(dt), before.t)
-                state.assign(before)
-                raise FunnelError(message)
+                raise FunnelError(_left_funnel(loop, kind, funnels, ratio, e_before, funnel_before, dt, before.t))
+
+
+def _worst(loop: ClosedLoop, funnels: Funnels, ratio: FloatArray) -> tuple[str, float]:
+    """Whose |e| is largest (a NaN counts as that), for a message, and how large."""
+    layout, fleet = funnels.layout, loop.fleet
+    column, env = np.unravel_index(int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio))), ratio.shape)
+    agent, component, _ = fleet.component_names()[layout.column_source[column]]
+    observer = fleet.ids[layout.observer[layout.column_pair[column]]]
+    return f"{agent!r} in {observer!r}, component {component!r}, environment {env},", float(ratio[column, env])
 
 
 def _left_funnel(
@@ -121,17 +149,15 @@ def _left_funnel(
     t: FloatArray,
 ) -> str:
     """Which observer left its funnel, when, and the step that would have been stable just before."""
-    layout, fleet = funnels.layout, loop.fleet
+    layout = funnels.layout
     column, env = np.unravel_index(int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio))), ratio.shape)
     target = int(layout.row_target[layout.column_row[column]])
     curvature = np.zeros((len(layout.target), loop.batch))
     largest_curvature(layout.plan, e, funnel, curvature)
     stable = 2.0 / (layout.eigenvalues[target, 1] * curvature[target, env])
-    agent, component, _ = fleet.component_names()[layout.column_source[column]]
-    letter = "e" if kind == "state" else "q"
+    who, largest = _worst(loop, funnels, ratio)
     return (
-        f"the explicit step left the funnel: {kind} observer of {agent!r} in "
-        f"{fleet.ids[layout.observer[layout.column_pair[column]]]!r}, component {component!r}, environment {env}, "
-        f"reached |{letter}| = {ratio[column, env]:.4g} at t = {t[env] + dt:.6g} s with dt = {dt:g} s; just before, "
-        f"a step below {min(stable, dt):.2g} s would have been stable: take a shorter one, or the proximal integrator"
+        f"the explicit step left the funnel: {kind} observer of {who} reached |{'e' if kind == 'state' else 'q'}| = "
+        f"{largest:.4g} at t = {t[env] + dt:.6g} s with dt = {dt:g} s; just before, a step below "
+        f"{min(stable, dt):.2g} s would have been stable: take a shorter one, or the proximal integrator"
     )

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,13 +10,15 @@ import numpy as np
 
 from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, PairLayout
+from khop_env.physics import Fleet
 from khop_env.simulation import proximal
 from khop_env.simulation.closed_loop import ClosedLoop
+from khop_env.simulation.solver import Solver
 from khop_env.simulation.state import SimulatorState
 
 
 class SolveError(RuntimeError):
-    """A proximal step failed, which only numbers that aren't finite can make it do."""
+    """A step met numbers that aren't finite, in a state, an input, a disturbance or an estimate."""
 
 
 class Integrator(Protocol):
@@ -102,10 +100,6 @@ class Proximal:
         self._tableau = TABLEAUS[order]
         self._explicit = [np.array(row) for row in self._tableau.explicit]
         self._implicit = [np.array(row) for row in self._tableau.implicit]
-        self._pool: tuple[int, ThreadPoolExecutor] | None = None
-
-    def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_pool": None}  # threads don't survive pickling or forking
 
     def prepare(self, loop: ClosedLoop) -> None:
         """Allocate what steps of this closed loop need."""
@@ -117,92 +111,65 @@ class Proximal:
         self._belief = tuple(np.zeros((pairs, batch)) for _ in range(stages))
         self._slope = tuple(np.zeros((pairs, batch)) for _ in range(stages))
         self._input_slope = tuple(np.zeros((input_pairs, batch)) for _ in range(stages))
-        self._x0, self._y0, self._ghat0 = (np.zeros((rows, batch)) for rows in (n, pairs, input_pairs))
+        self._before = SimulatorState.zeros(batch, n, loop.fleet.m, pairs, input_pairs, 0)
         self._rho = np.ones((loop.state_layout.rows, batch))
         self._omega = np.ones((loop.input_layout.rows, batch))
-        self._solve_states = self._solver(loop.state_layout)
-        self._solve_inputs = self._solver(loop.input_layout) if input_pairs else None
+        self._solve_states = Solver(loop.state_layout, batch, self.threads)
+        self._solve_inputs = Solver(loop.input_layout, batch, self.threads)
 
     def start(self, state: SimulatorState) -> None:
         """Make u and g agree with t, x and the estimates."""
-        self._command(state)
+        self._loop.command(state.t, state.x, state.estimate, state.u)
+        self._loop.fleet.input_map(state.t, state.x.T, state.u.T, state.g.T)
 
     def step(self, state: SimulatorState, dt: float) -> None:
-        """Advance by `dt` seconds, in place.
+        """Advance by `dt` seconds, in place. Where anything raises, the state is the one before the step.
 
         Raises:
-            SolveError: if a state, input, disturbance or estimate isn't finite; the state is the one before the step.
+            SolveError: if a state, input, disturbance or estimate isn't finite.
         """
-        t0 = state.t.copy()
-        np.copyto(self._x0, state.x)
-        np.copyto(self._y0, state.estimate)
-        np.copyto(self._ghat0, state.input_estimate)
+        state.copy_dynamic(self._before)
         try:
-            self._stages(state, t0, dt)
-        except SolveError:  # back to where the step began
-            state.t[...], state.x[...], state.estimate[...], state.input_estimate[...] = (
-                t0,
-                self._x0,
-                self._y0,
-                self._ghat0,
-            )
-            self._command(state)
+            self._stages(state, dt)
+        except BaseException:
+            self._before.copy_dynamic(state)
             raise
 
-    def _stages(self, state: SimulatorState, t0: FloatArray, dt: float) -> None:
-        loop = self._loop
+    def _stages(self, state: SimulatorState, dt: float) -> None:
+        loop, before = self._loop, self._before
         for s, node in enumerate(self._tableau.nodes):
             # slopes at the stage before; the state holds that stage's values, at its time
             loop.plant(state.t, state.x, state.g, state.drawn, self._plant[s])
             loop.belief(state.t, state.estimate, state.input_estimate, self._belief[s])
             explicit, implicit = self._explicit[s] * dt, self._implicit[s] * dt
             tau = float(implicit[s])
-            np.add(t0, node * dt, out=state.t)
-            _weighted_sum(self._x0, explicit, self._plant[: s + 1], state.x)
-            _weighted_sum(self._y0, explicit, self._belief[: s + 1], state.estimate)
+            np.add(before.t, node * dt, out=state.t)
+            _weighted_sum(before.x, explicit, self._plant[: s + 1], state.x)
+            require_finite(state.x, loop.fleet)
+            _weighted_sum(before.estimate, explicit, self._belief[: s + 1], state.estimate)
             if s:
                 _weighted_sum(state.estimate, implicit[:s], self._slope[:s], state.estimate)
             loop.rho.evaluate(state.t, self._rho)
-            self._solve_states(tau, state.estimate, state.x, self._rho, state.eps, self._slope[s])
-            self._command(state)
-            if self._solve_inputs is not None:
+            found = self._solve_states(tau, state.estimate, state.x, self._rho, state.eps, self._slope[s])
+            self._account(found, loop.state_layout, state.x, self._rho)
+            self.start(state)
+            if loop.input_layout.size:
                 if s:
-                    _weighted_sum(self._ghat0, implicit[:s], self._input_slope[:s], state.input_estimate)
+                    _weighted_sum(before.input_estimate, implicit[:s], self._input_slope[:s], state.input_estimate)
                 loop.omega.evaluate(state.t, self._omega)
-                self._solve_inputs(tau, state.input_estimate, state.g, self._omega, state.nu, self._input_slope[s])
-
-    def _command(self, state: SimulatorState) -> None:
-        self._loop.command(state.t, state.x, state.estimate, state.u)
-        self._loop.fleet.input_map(state.t, state.x.T, state.u.T, state.g.T)
-
-    def _solver(self, layout: PairLayout) -> Callable[..., None]:
-        """The proximal solve of one layout, split over threads by environments or, in a small batch, by targets."""
-        arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
-        batch, targets = self._loop.batch, len(layout.plan)
-        if batch >= self.threads * proximal.LANES:
-            cuts = np.linspace(0, batch, self.threads + 1).astype(int).tolist()
-            ranges = [((b0, b1), (0, targets)) for b0, b1 in itertools.pairwise(cuts)]
-        else:
-            cuts = np.linspace(0, targets, self.threads + 1).astype(int).tolist()
-            ranges = [((0, batch), (t0, t1)) for t0, t1 in itertools.pairwise(cuts)]
-
-        def solve(
-            tau: float, y: FloatArray, source: FloatArray, rho: FloatArray, eps: FloatArray, slope: FloatArray
-        ) -> None:
-            if len(ranges) == 1:
-                results = [proximal.solve(*arrays, tau, y, source, rho, eps, y, slope, *ranges[0])]
-            else:
-                results = list(
-                    self._threads().map(
-                        lambda part: proximal.solve(*arrays, tau, y, source, rho, eps, y, slope, *part), ranges
-                    )
+                found = self._solve_inputs(
+                    tau, state.input_estimate, state.g, self._omega, state.nu, self._input_slope[s]
                 )
-            for evaluations, env, line in results:
-                self.evaluations += evaluations
-                if env >= 0:
-                    raise SolveError(self._failure(layout, line, env, source, rho))
+                self._account(found, loop.input_layout, state.g, self._omega)
 
-        return solve
+    def _account(
+        self, found: list[tuple[int, int, int]], layout: PairLayout, source: FloatArray, rho: FloatArray
+    ) -> None:
+        """Count the work of a solve, and say why it failed if it did."""
+        for evaluations, env, line in found:
+            self.evaluations += evaluations
+            if env >= 0:
+                raise SolveError(self._failure(layout, line, env, source, rho))
 
     def _failure(self, layout: PairLayout, line: int, env: int, source: FloatArray, rho: FloatArray) -> str:
         fleet, (_, n, _, origin, row, _) = self._loop.fleet, layout.plan[line].tolist()
@@ -222,7 +189,18 @@ class Proximal:
             "iterations; check the agent model's drift at the estimates, and please report the latter"
         )
 
-    def _threads(self) -> ThreadPoolExecutor:
-        if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads
-            self._pool = (os.getpid(), ThreadPoolExecutor(self.threads))
-        return self._pool[1]
+
+def require_finite(x: FloatArray, fleet: Fleet) -> None:
+    """Refuse states (n, B) that became NaN or infinite, also those of agents that nobody estimates.
+
+    Raises:
+        SolveError: naming the environment, agent and component.
+    """
+    if math.isfinite(x.sum()):
+        return
+    for column, env in np.argwhere(~np.isfinite(x)).tolist():
+        agent, name, _ = fleet.component_names()[column]
+        raise SolveError(
+            f"environment {env}: state {name!r} of {agent!r} became {x[column, env]}; check its agent model, the law "
+            "and the disturbance, or take a shorter step if the plant itself diverged"
+        )

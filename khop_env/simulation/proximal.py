@@ -70,16 +70,18 @@ def eps_of_impulse(z: float) -> float:
 
 
 @compiled
-def _barriers(rows: int, lanes: int, u: FloatArray, e: FloatArray, z: FloatArray, gain: FloatArray) -> None:
-    """The barrier at u[:rows, :lanes]; in one long loop where nothing lies between the rows."""
-    if lanes == u.shape[1]:
-        flat_u, flat_e, flat_z, flat_gain = u.reshape(-1), e.reshape(-1), z.reshape(-1), gain.reshape(-1)
+def _barriers(
+    rows: int, lanes: int, stride: int, u: FloatArray, e: FloatArray, z: FloatArray, gain: FloatArray
+) -> None:
+    """The barrier at `lanes` entries of each row of flat arrays, in one long loop where nothing lies between rows."""
+    if lanes == stride:
         for q in range(rows * lanes):
-            flat_e[q], flat_z[q], flat_gain[q] = _barrier(flat_u[q])
+            e[q], z[q], gain[q] = _barrier(u[q])
     else:
         for a in range(rows):
             for lane in range(lanes):
-                e[a, lane], z[a, lane], gain[a, lane] = _barrier(u[a, lane])
+                q = place(a * stride + lane)
+                e[q], z[q], gain[q] = _barrier(u[q])
 
 
 @compiled
@@ -191,10 +193,13 @@ def solve(
         widest, profile = max(widest, eta), max(profile, entries)
         most = max(most, n * min(max(1, LANES // n), batch[1] - batch[0]))
     work = np.empty((9, widest, most))
-    b, e, z, gain, dz, u, answer = work[0], work[1], work[2], work[3], work[4], work[7], work[8]
+    b, z, gain, dz, u, answer = work[0], work[2], work[3], work[4], work[7], work[8]
+    flat = work.reshape(9, widest * most)
+    flat_e, flat_z, flat_gain, flat_u = flat[1], flat[2], flat[3], flat[7]
     lower = np.empty((profile, most))
     row_start = np.empty(widest, np.int64)
-    inv_rho, scale, worst, active = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
+    inv_rho, scale, active = np.empty(most), np.empty(most), np.empty(most)
+    worst, poison = np.empty(most), np.empty(most)
     evaluations = 0
 
     for t in range(targets[0], targets[1]):
@@ -236,24 +241,26 @@ def solve(
             iteration = 0
             moving = True
             while moving:
-                _barriers(eta, lanes, u, e, z, gain)
+                _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 _newton_step((eta, pair, lanes), diagonal, link_start, link, first, scale, work, lower, row_start)
                 evaluations += eta * lanes
                 iteration += 1
                 for lane in range(lanes):
                     worst[lane] = 0.0
+                    poison[lane] = 0.0
                 # a lane that is done must not move again, or its result would depend on its company
                 for a in range(eta):
                     for lane in range(lanes):
                         on = active[lane] > 0.0
                         step = dz[a, lane] * gain[a, lane] if on else 0.0
                         worst[lane] = max(abs(step), worst[lane])
+                        poison[lane] += 0.0 * step  # 0, or NaN for good, which a maximum may lose
                         answer[a, lane] = z[a, lane] + dz[a, lane] if on else answer[a, lane]
                         u[a, lane] += step
                 moving = False
                 longest = 0.0
                 for lane in range(lanes):
-                    on = not worst[lane] <= TOLERANCE  # so that a NaN goes on, to be reported
+                    on = not worst[lane] + poison[lane] <= TOLERANCE  # so that a NaN goes on, to be reported
                     active[lane] = 1.0 if on else 0.0
                     moving = moving or on
                     longest = max(longest, worst[lane])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -90,7 +91,7 @@ class Simulator:
         self.design, self.fleet, self.initial, self.batch = design, design.fleet, initial, batch
         bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` sees where it starts
         design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
-        self.integrator: Integrator = integrator or Proximal()
+        self.integrator: Integrator = copy.copy(integrator or Proximal())  # its buffers are this simulator's own
         attached = None if disturbance is None else disturbance.attach(self.fleet)
         self._loop = ClosedLoop(design, attached, law, task, observe, batch)
         draws = 0 if attached is None else attached.draws
@@ -170,21 +171,14 @@ class Simulator:
         seeds = [seed + b for b in range(self.batch)] if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != self.batch:
             raise ValueError(f"expected one seed or {self.batch}, one per environment; got {len(seeds)}")
+        given = self._initial_states(x0)
         state, loop = self._state, self._loop
         for b, one in enumerate(seeds):
             rng = np.random.default_rng(one)
             state.x[:, b] = self.initial.draw(rng)
             if loop.disturbance is not None:
                 state.drawn[b] = loop.disturbance.draw(rng)
-        if x0 is not None:
-            given = np.asarray(x0, dtype=float)
-            if given.shape not in ((self.fleet.n,), (self.batch, self.fleet.n)) or not np.all(np.isfinite(given)):
-                raise ValueError(
-                    f"x0 must be finite, of shape ({self.fleet.n},) or ({self.batch}, {self.fleet.n}); got shape "
-                    f"{given.shape}"
-                )
-            away = np.abs(given - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
-            self.design.require_feasible_start(away, np.zeros(self.fleet.n))
+        if given is not None:
             state.x[...] = np.broadcast_to(given, (self.batch, self.fleet.n)).T
         state.t[...] = 0.0
         state.u[...] = 0.0
@@ -206,6 +200,7 @@ class Simulator:
         Args:
             dt: step in s, positive.
             u: (m,) or (B, m) inputs held over the step, where the simulator has no law; the last ones if left out.
+                They are used as given: whoever needs the input limits, as a bounded g does, keeps them.
 
         Raises:
             ValueError: for a step that isn't positive, or inputs given to a simulator with a law, misshapen or not
@@ -233,6 +228,20 @@ class Simulator:
         self._state.assign(saved)
         self._extremes[...] = 0.0
         self._watch()
+
+    def _initial_states(self, x0: ArrayLike | None) -> FloatArray | None:
+        """Check given initial states, before anything is overwritten."""
+        if x0 is None:
+            return None
+        given = np.asarray(x0, dtype=float)
+        if given.shape not in ((self.fleet.n,), (self.batch, self.fleet.n)) or not np.all(np.isfinite(given)):
+            raise ValueError(
+                f"x0 must be finite, of shape ({self.fleet.n},) or ({self.batch}, {self.fleet.n}); got shape "
+                f"{given.shape}"
+            )
+        away = np.abs(given - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
+        self.design.require_feasible_start(away, np.zeros(self.fleet.n))
+        return given
 
     def _hold(self, u: ArrayLike) -> None:
         if self._loop.law is not None:

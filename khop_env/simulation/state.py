@@ -37,7 +37,16 @@ class SimulatorState:
 
     @staticmethod
     def zeros(batch: int, n: int, m: int, pairs: int, input_pairs: int, draws: int) -> SimulatorState:
-        """A state of zeros."""
+        """A state of zeros.
+
+        Args:
+            batch: number of environments B.
+            n: states of the fleet.
+            m: inputs of the fleet.
+            pairs: P, the length of the state estimates.
+            input_pairs: Q, the length of the input estimates.
+            draws: K, the disturbance's random numbers.
+        """
         t, drawn = np.zeros(batch), np.zeros((batch, draws))
         x, u, g, y, eps, ghat, nu = (np.zeros((k, batch)) for k in (n, m, n, pairs, pairs, input_pairs, input_pairs))
         return SimulatorState(t, x, u, g, y, eps, ghat, nu, drawn)
@@ -45,6 +54,11 @@ class SimulatorState:
     def copy(self) -> SimulatorState:
         """An independent copy."""
         return SimulatorState(*(getattr(self, f.name).copy() for f in fields(self)))
+
+    def copy_dynamic(self, other: SimulatorState) -> None:
+        """Write all but the episode's draws into `other`, of the same shapes; quicker than `assign`."""
+        for name in ("t", "x", "u", "g", "estimate", "eps", "input_estimate", "nu"):
+            np.copyto(getattr(other, name), getattr(self, name))
 
     def assign(self, other: SimulatorState) -> None:
         """Overwrite this state in place.

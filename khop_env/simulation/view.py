@@ -93,6 +93,7 @@ class ViewBuilder:
         """The view at states `x` (n, B) and estimates (P, B)."""
         displacements(self._kind, self._own, self._other, x, estimate, self._columns)
         self.view.x = x.T
+        self.view.displacement = self._columns.transpose(2, 0, 1)  # anew: a copy of this object would lose the tie
         return self.view
 
 

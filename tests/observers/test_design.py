@@ -27,7 +27,7 @@ def error_bound_of(bounds, target, t):
 
 @given(system=systems())
 def test_design_rule_makes_the_norm_of_rho_what_problem_2_allows(system):
-    """Problem 2: |rho_i(t)| <= lambda_min(M_i) min_j delta_i^j(t), for states and inputs, with equality for one delta."""
+    """Problem 2: |rho_i(t)| <= lambda_min(M_i) min_j delta_i^j(t), for states and inputs; equal for one delta."""
     for funnels, bounds in ((system.design.states, system.deltas), (system.design.inputs, system.thetas)):
         layout = funnels.layout
         rho = funnels.rho.evaluate(TIMES, np.empty((layout.rows, TIMES.size)))
@@ -45,7 +45,9 @@ def test_design_rule_makes_the_norm_of_rho_what_problem_2_allows(system):
 
 @given(graph=connected_graphs(), about=hops(), seed=SEEDS)
 def test_disagreement_within_rho_implies_error_within_delta(graph, about, seed):
-    """Section III: |x_tilde| <= |M^-1| |xi|, so that |xi_a| < rho for all a gives |x_tilde_a| < delta; corners included."""
+    """Section III: |x_tilde| <= |M^-1| |xi|, so that |xi_a| < rho for all a gives |x_tilde_a| < delta; corners
+    included.
+    """
     k, relay = about
     design = ObserverDesign(scalar_fleet(len(graph)), graph, k, ONE, ONE, relay)
     rng = np.random.default_rng(seed)
@@ -93,7 +95,9 @@ def test_feasible_at_start_is_the_worst_case_over_the_initial_set(system):
 @settings(max_examples=50)
 @given(graph=connected_graphs(), about=hops(), radius=st.floats(1e-3, 1e3), pick=SEEDS)
 def test_smallest_initial_bound_is_tight_from_both_sides(graph, about, radius, pick):
-    """Just above it |xi(0)| < rho(0) holds for the whole initial set, just below it doesn't; for one target and for all."""
+    """Just above it |xi(0)| < rho(0) holds for the whole initial set, just below it doesn't; for one target and for
+    all.
+    """
     k, relay = about
     fleet = scalar_fleet(len(graph))
 
@@ -120,7 +124,7 @@ def test_smallest_initial_bound_is_tight_from_both_sides(graph, about, radius, p
 
 
 def test_refused_start_names_agent_component_and_numbers():
-    """Path of three, one observer per end: M = [1], so rho = delta, and the component with the larger share is named."""
+    """Path of three, one observer per end: M = [1], so rho = delta, the component with the larger share is named."""
     fleet = Fleet([SingleIntegrator(), DriftingIntegrator(), SingleIntegrator()])
     delta = Exponential(2.0, 0.1, 1.0)
     design = ObserverDesign(fleet, nx.path_graph(3), 2, delta, Exponential(9.0, 1.0, 1.0))
@@ -160,7 +164,9 @@ PLAIN, NO_INPUT = TargetObservers(), TargetObservers(input_observer=False)
     ],
 )
 def test_designs_that_no_theorem_covers_are_refused(fleet, delta, theta, targets, message):
-    """Remark 1 (g(x, u) has no PPIO), Assumption 2-i (no PPIO needs bounded g), and bounds that are missing or misshapen."""
+    """Remark 1 (g(x, u) has no PPIO), Assumption 2-i (no PPIO needs bounded g), and bounds that are missing or
+    misshapen.
+    """
     with pytest.raises(DesignError, match=message):
         ObserverDesign(fleet, TREE, 2, delta, theta, targets=targets)
 
@@ -181,7 +187,7 @@ def test_graphs_that_the_assumptions_exclude_are_refused(graph, k, message):
 
 
 def test_default_observers_leave_out_the_input_observer_where_g_depends_on_the_state():
-    """Remark on Assumption 2: g_i(x_i, u_i) is allowed without PPIO; a bound may be one function or one per component."""
+    """Remark on Assumption 2: g_i(x_i, u_i) is allowed without PPIO; bounds are one function or one per component."""
     design = ObserverDesign(
         UNICYCLES, TREE, 2, dict.fromkeys(range(3), ONE) | {3: (ONE, ONE, Exponential(2.0, 1.0, 1.0))}, ONE
     )
@@ -193,7 +199,9 @@ def test_default_observers_leave_out_the_input_observer_where_g_depends_on_the_s
 
 @given(system=systems())
 def test_explicit_step_bound_is_where_euler_stops_damping(system):
-    """Linearised at e = 0 in steady state, a step multiplies errors by I - dt (4 / rho^2) M: stable iff dt below the bound."""
+    """Linearised at e = 0 in steady state, a step multiplies errors by I - dt (4 / rho^2) M: stable iff dt below the
+    bound.
+    """
     states = system.design.states
     bound = states.explicit_step_bound()
     floor = states.rho.infimum()

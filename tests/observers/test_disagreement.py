@@ -1,4 +1,6 @@
-"""Section III of the paper: the matrices M_i and the disagreements, against their definitions written out from the graph."""
+"""Section III of the paper: the matrices M_i and the disagreements, against their definitions written out from the
+graph.
+"""
 
 import networkx as nx
 import numpy as np
@@ -70,7 +72,7 @@ def test_lemma_1_the_matrices_are_positive_definite(drawn):
 
 
 def test_lemma_1_needs_a_connected_graph():
-    """Two agents that hear only each other have no path to the target: M would be singular, so they aren't observers."""
+    """Two agents that hear only each other have no path to the target: M would be singular; they aren't observers."""
     graph = nx.Graph([(0, 1), (1, 2), (3, 4)])
     layout = PairLayout.build(graph, k_hop_neighbors(graph, 4), [1] * 5, range(5), relay=True)
     assert layout.target.tolist() == [0, 2]
@@ -161,7 +163,7 @@ def test_without_relay_nobody_reads_a_state_it_does_not_hear(graph, k):
 
 
 def test_the_paper_s_tree_has_the_published_constant():
-    """rho(inf) / delta(inf) = 0.02 / 0.117 of agent 4 (here 3): lambda_min(M_4) / sqrt(5) = (3 - sqrt 5) / 2 / sqrt 5."""
+    """rho(inf) / delta(inf) = 0.02 / 0.117 of agent 4 (here 3): lambda_min / sqrt(5) = (3 - sqrt 5) / 2 / sqrt 5."""
     graph = nx.Graph([*((i, i + 1) for i in range(6)), (4, 7)])
     layout = PairLayout.build(graph, k_hop_neighbors(graph, 3), [2] * 8, range(0, 16, 2), relay=True)
     smallest = layout.eigenvalues[layout.target.tolist().index(3), 0]

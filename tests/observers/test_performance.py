@@ -52,7 +52,9 @@ def test_what_is_no_performance_function_is_refused(values):
 
 @given(functions=st.lists(exponentials(), min_size=1, max_size=6), seed=SEEDS)
 def test_lemma_2_the_norm_of_funnels_is_a_funnel(functions, seed):
-    """Lemma 2: |rho(t)| is positive, bounded by the norm of the bounds, with |d/dt| at most the norm of the derivatives."""
+    """Lemma 2: |rho(t)| is positive, bounded by the norm of the bounds, with |d/dt| at most the norm of the
+    derivatives.
+    """
     values = np.array([rho(TIMES) for rho in functions])
     norm = np.linalg.norm(values, axis=0)
     assert np.all(norm > 0.0)

@@ -82,7 +82,9 @@ def test_barrier_in_the_transformed_unknown(eps):
 
 @given(eps=st.floats(-30.0, 30.0))
 def test_impulse_and_curvature_agree(eps):
-    """d z / d e = phi''(e), so that Newton's matrix diag(de / dz) + s M is the proximal problem's Hessian; de/dz <= 1/4."""
+    """d z / d e = phi''(e), so that Newton's matrix diag(de / dz) + s M is the proximal problem's Hessian; de/dz <=
+    1/4.
+    """
     e, _, gain = _barrier(eps)
     exact = mpmath.mpf(eps)
     slope_of_e = mpmath.mpf(gain) / (1 + mpmath.cosh(exact))  # de/dz = de/deps deps/dz
@@ -113,7 +115,9 @@ def test_no_impulse_is_no_disagreement():
     seed=st.integers(0, 2**32 - 1),
 )
 def test_correction_is_the_paper_s_formula(sizes, seed):
-    """-rho^-1 J_T(e) eps with e = xi / rho (the last term of the PPSO's and the PPIO's equation), for all pairs at once."""
+    """-rho^-1 J_T(e) eps with e = xi / rho (the last term of the PPSO's and the PPIO's equation), for all pairs at
+    once.
+    """
     n, batch = sizes
     rng = np.random.default_rng(seed)
     graph = nx.path_graph(6)

@@ -41,9 +41,11 @@ def reference():
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_order_of_convergence(order, reference):
-    """ARS(1,1,1) and ARS(2,2,2) (numerics, section 3) converge with their order, in states, estimates and input estimates.
+    """ARS(1,1,1) and ARS(2,2,2) (numerics, section 3) converge with their order, in states, estimates and input
+    estimates.
 
-    The largest error over ten instants of the first second, the paper's closed loop with disturbances, dt 1e-3 to 1e-2.
+    The largest error over ten instants of the first second, the paper's closed loop with disturbances, dt 1e-3 to
+    1e-2.
     """
     errors = np.zeros((3, len(STEPS)))
     for column, dt in enumerate(STEPS):
@@ -61,7 +63,8 @@ def test_order_of_convergence(order, reference):
 def test_proximal_agrees_with_the_paper_s_sampling(start, dt, tolerance):
     """The proximal step solves the paper's equations: explicit Euler at 1e-5 s, as published, gives the same motion.
 
-    From the start, where funnels are wide and move fast, and from t = 2 s, where they are narrow and the equations stiff.
+    From the start, where funnels are wide and move fast, and from t = 2 s, where they are narrow and the equations
+    stiff.
     """
     proximal = closed_loop(Proximal(2))
     for _ in range(round(start / 1e-3)):

@@ -1,4 +1,5 @@
-"""Decentralisation (the remark after the PPSO's equation): an observer uses what its 1-hop neighbours send, and no more.
+"""Decentralisation (the remark after the PPSO's equation): an observer uses what its 1-hop neighbours send, and no
+more.
 
 In one message agent l sends its own estimates and, under Assumption 4, the states and inputs of its neighbours.
 """
@@ -42,8 +43,8 @@ class Probe:
 @settings(max_examples=60)
 @given(system=systems(largest=7))
 def test_an_observer_hears_its_neighbors_only(system):
-    """A change of all that an agent outside N_a and a knows, its state, its effect g and its estimates, changes no bit of
-    a's right-hand side, unless it is the target itself, whose state (and g) a neighbour relays where h_a > 0.
+    """A change of all that an agent outside N_a and a knows, its state, its effect g and its estimates, changes no bit
+    of a's right-hand side, unless it is the target itself, whose state (and g) a neighbour relays where h_a > 0.
     """
     probe, graph = Probe(system), system.design.communication
     before = probe.derivative(probe.state)
@@ -70,7 +71,8 @@ def test_an_observer_hears_its_neighbors_only(system):
 @settings(max_examples=60)
 @given(system=systems(largest=7))
 def test_an_observer_does_hear_its_neighbors(system):
-    """The control of the test above: the estimates of a's neighbours in N_i^{k-hop}, and x_i where it is relayed, do matter.
+    """The control of the test above: the estimates of a's neighbours in N_i^{k-hop}, and x_i where it is relayed, do
+    matter.
 
     And nothing else of a neighbour does: its own state, and its estimates of third agents, enter the disagreement on i
     in no way.
@@ -105,8 +107,8 @@ def test_an_observer_does_hear_its_neighbors(system):
 @settings(max_examples=60)
 @given(system=systems(largest=7))
 def test_a_law_acts_on_what_its_agent_knows(system):
-    """u_i = psi_i(x_bar_i, x_hat^i) (Section V): a change of the state of an agent out of i's earshot changes no bit of u_i,
-    nor does a change of the estimates of such an agent.
+    """u_i = psi_i(x_bar_i, x_hat^i) (Section V): a change of the state of an agent out of i's earshot changes no bit
+    of u_i, nor does a change of the estimates of such an agent.
     """
     simulator = system.simulator(Proximal(), law=TanhConsensus(1.0))
     simulator.step(0.02)

@@ -61,7 +61,7 @@ def test_a_row_of_a_batch_is_the_single_run_of_its_seed(integrator, system, batc
 
 
 def large_batch(batch: int, threads: int) -> Simulator:
-    """A small closed loop with disturbances, stepped a few times; batches of LANES a thread are split by environments."""
+    """A small closed loop with disturbances, stepped a few times; LANES environments a thread are split by rows."""
     fleet = Fleet([DriftingIntegrator()] * 3 + [Unicycle()])
     bound = Exponential(60.0, 0.2, 3.0)
     graph = nx.path_graph(4)
@@ -168,7 +168,7 @@ def test_a_state_of_another_shape_is_refused_and_changes_nothing():
     with pytest.raises(ValueError, match=r"t has shape \(3,\), this simulator's is \(2,\)"):
         simulator.restore(paper().build(batch=3).save())
     other = paper().replace(k=2, task=nx.empty_graph(8)).build(batch=2)
-    with pytest.raises(ValueError, match="estimate has shape .* saved by another scenario or batch size"):
+    with pytest.raises(ValueError, match=r"estimate has shape .* saved by another scenario or batch size"):
         simulator.restore(other.save())
     assert_same_bits(simulator.save(), before)
 

@@ -1,8 +1,9 @@
-"""The paper's theorems on random systems: every bound at every step, from the definitions and not from the library's own.
+"""The paper's theorems on random systems: every bound at every step, from the definitions and not from the library's
+own.
 
 Each theorem is run with the proximal step at steps of 0.05 s, where the funnels hold by construction and the theorem
-says that the equations solved are the right ones, and with explicit Euler, which has no guarantee of its own: there the
-funnels hold because the continuous-time observers keep them. Disturbances act in all runs.
+says that the equations solved are the right ones, and with explicit Euler, which has no guarantee of its own: there
+the funnels hold because the continuous-time observers keep them. Disturbances act in all runs.
 """
 
 import networkx as nx
@@ -78,7 +79,8 @@ def draw_system(data: st.DataObject, integrator: str, **options: object) -> Syst
 @settings(max_examples=25)
 @given(data=st.data(), gain=st.floats(0.1, 3.0))
 def test_theorem_1_state_observers_with_input_observers(integrator, data, gain):
-    """Theorem 1: |g_tilde| bounded (by Theorem 3), |xi(0)| < rho(0) and the design rule give |x_tilde| < delta for all t.
+    """Theorem 1: |g_tilde| bounded (by Theorem 3), |xi(0)| < rho(0) and the design rule give |x_tilde| < delta for all
+    t.
 
     The closed loop of Section VI on mixed fleets: the law acts on the estimates.
     """
@@ -110,7 +112,8 @@ def test_theorem_3_input_observers_under_lipschitz_inputs(integrator, data):
 @settings(max_examples=25)
 @given(data=st.data())
 def test_remark_no_input_observer_where_g_is_bounded(integrator, data):
-    """Remark on omitting the PPIO: under Assumption 2-i, g_i(x_i, u_i) is one more bounded disturbance; inputs may jump.
+    """Remark on omitting the PPIO: under Assumption 2-i, g_i(x_i, u_i) is one more bounded disturbance; inputs may
+    jump.
 
     Unicycles, whose g depends on the state, included.
     """
@@ -132,14 +135,18 @@ def test_both_simplifications_together(integrator, data):
 @settings(max_examples=25)
 @given(data=st.data(), gain=st.floats(0.1, 3.0))
 def test_without_relay(integrator, data, gain):
-    """Remark after Lemma 1: without Assumption 4 the theorems hold with 1-hop neighbours estimated and H = diag(1, .., 0)."""
+    """Remark after Lemma 1: without Assumption 4 the theorems hold with 1-hop neighbours estimated and H = diag(1, ..,
+    0).
+    """
     system = draw_system(data, integrator, models=PLANAR, relay=False)
     run(system, integrator, TanhConsensus(gain))
 
 
 @pytest.mark.parametrize("which", ["drift", "input_observer"])
 def test_what_a_simplification_leaves_out_is_left_out(which):
-    """Theorem 2 and the remark: without disagreement an estimate moves with f_i and g_hat where its observer knows them."""
+    """Theorem 2 and the remark: without disagreement an estimate moves with f_i and g_hat where its observer knows
+    them.
+    """
     fleet, one = Fleet([DriftingIntegrator()] * 3), Exponential(100.0, 100.0, 1.0)
     options = [TargetObservers(**{which: known}) for known in (True, True, False)]
     design = ObserverDesign(fleet, nx.path_graph(3), 2, one, one, targets=options)

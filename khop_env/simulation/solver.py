@@ -1,0 +1,48 @@
+"""The proximal solve of one layout, split over Python threads; the compiled code doesn't hold the GIL."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from khop_env.observers import FloatArray, PairLayout
+from khop_env.simulation import proximal
+
+
+class Solver:
+    """Solves for all observers of one layout, by environments or, in a small batch, by targets.
+
+    Args:
+        layout: who estimates whom.
+        batch: number of environments.
+        threads: how many threads share the work; results don't depend on it.
+    """
+
+    def __init__(self, layout: PairLayout, batch: int, threads: int) -> None:
+        self._arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
+        targets = len(layout.plan)
+        by_environment = batch >= threads * proximal.LANES
+        cuts = np.linspace(0, batch if by_environment else targets, threads + 1).astype(int).tolist()
+        parts = list(itertools.pairwise(cuts))
+        self._ranges = [(part, (0, targets)) if by_environment else ((0, batch), part) for part in parts]
+        self._pool: tuple[int, ThreadPoolExecutor] | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_pool": None}  # threads don't survive pickling
+
+    def __call__(
+        self, tau: float, y: FloatArray, source: FloatArray, rho: FloatArray, eps: FloatArray, slope: FloatArray
+    ) -> list[tuple[int, int, int]]:
+        """`proximal.solve` from the predictor `y`, which the estimates overwrite; what it returns, range by range."""
+        if len(self._ranges) == 1:
+            return [proximal.solve(*self._arrays, tau, y, source, rho, eps, y, slope, *self._ranges[0])]
+        if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads
+            self._pool = (os.getpid(), ThreadPoolExecutor(len(self._ranges)))
+        return list(
+            self._pool[1].map(
+                lambda part: proximal.solve(*self._arrays, tau, y, source, rho, eps, y, slope, *part), self._ranges
+            )
+        )
