@@ -80,24 +80,24 @@ class ObserverAgent:
         Without an input observer of that target the second and the fourth are empty.
         """
         target = self.targets[i]
-        heard = [inbox[p].relayed.get(i, (inbox[p].state, inbox[p].input_map)) for p in target.relays]
-        xi = np.zeros_like(target.estimate)
-        for peer in target.peers:
-            xi += target.estimate - inbox[peer].estimates[i]
-        for state, _ in heard:
-            xi += target.estimate - state
-        rate, e = _correction(t, xi, target.rho)
+        told = [inbox[p].relayed.get(i, (inbox[p].state, inbox[p].input_map)) for p in target.relays]
+        others = [inbox[p].estimates[i] for p in target.peers] + [state for state, _ in told]
+        rate, e = _correction(t, _disagreement(target.estimate, others), target.rho)
         if target.drift_known:
             rate = rate + target.model.drift(np.array([t]), target.estimate[None])[0]
         if target.omega is None:
             return rate, np.zeros(0), e, np.zeros(0)
-        mu = np.zeros_like(target.input_estimate)
-        for peer in target.peers:
-            mu += target.input_estimate - inbox[peer].input_estimates[i]
-        for _, input_map in heard:
-            mu += target.input_estimate - input_map
-        input_rate, q = _correction(t, mu, target.omega)
+        others = [inbox[p].input_estimates[i] for p in target.peers] + [input_map for _, input_map in told]
+        input_rate, q = _correction(t, _disagreement(target.input_estimate, others), target.omega)
         return rate + target.input_estimate, input_rate, e, q
+
+
+def _disagreement(own: FloatArray, others: list[FloatArray]) -> FloatArray:
+    """The sum of how far one's own estimate is from what each of the others says."""
+    total = np.zeros_like(own)
+    for other in others:
+        total += own - other
+    return total
 
 
 def _correction(t: float, xi: FloatArray, funnels: tuple[PerformanceFunction, ...]) -> tuple[FloatArray, FloatArray]:
