@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,15 +24,15 @@ class TanhConsensus:
     size enter bounded. For the other models the set-ISS property is measured, not proven.
 
     Attributes:
-        gain: k_c in 1/s, positive.
+        gain: k_c in 1/s, positive and finite.
     """
 
     gain: float = 2.0
     _view: View | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not self.gain > 0.0:
-            raise ValueError(f"the gain of the tanh law must be positive; got {self.gain!r}")
+        if not 0.0 < self.gain < math.inf:
+            raise ValueError(f"the gain of the tanh law must be positive and finite; got {self.gain!r}")
 
     def __getstate__(self) -> dict[str, object]:
         return {"gain": self.gain, "_view": None}

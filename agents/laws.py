@@ -2,28 +2,57 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from typing import get_type_hints
 
 from agents.consensus import TanhConsensus
 from khop_env.physics import did_you_mean
 from khop_env.scenarios import LawChoice
+from khop_env.scenarios.checked import describe, fits
 from khop_env.simulation import Law
 
 LAWS: dict[str, Callable[..., Law]] = {"tanh": TanhConsensus}
+
+
+class LawError(ValueError):
+    """A law that there isn't, or that can't be made with these parameters.
+
+    Attributes:
+        parameter: The parameter that is wrong; None where it isn't one alone.
+    """
+
+    def __init__(self, message: str, parameter: str | None = None) -> None:
+        super().__init__(message)
+        self.parameter = parameter
 
 
 def make_law(choice: LawChoice | str) -> Law:
     """The law of a scenario, e.g. `make_law(scenario.law)`, or one by name with default parameters.
 
     Raises:
-        ValueError: for an unknown name or parameter.
+        LawError: for an unknown name or parameter, or a parameter of the wrong type or value.
     """
     choice = LawChoice(choice) if isinstance(choice, str) else choice
     if choice.name not in LAWS:
-        raise ValueError(f"no law {choice.name!r}; {did_you_mean(choice.name, LAWS)}")
+        raise LawError(f"no law {choice.name!r}; {did_you_mean(choice.name, LAWS)}")
+    make = LAWS[choice.name]
+    known = inspect.signature(make).parameters
+    hints = get_type_hints(make)
+    for name, value in choice.parameters.items():
+        if name not in known:
+            raise LawError(f"law {choice.name!r} has no parameter {name!r}; {_known(name, list(known))}", name)
+        expected = hints.get(name, known[name].annotation)
+        if expected in (int, float, bool, str) and not fits(value, expected):
+            raise LawError(f"{name} of law {choice.name!r} must be {describe(expected)}; got {value!r}", name)
     try:
-        return LAWS[choice.name](**choice.parameters)
-    except TypeError as error:
-        raise ValueError(
-            f"law {choice.name!r} doesn't take the parameters {dict(choice.parameters)}: {error}"
-        ) from error
+        return make(**choice.parameters)
+    except (TypeError, ValueError) as error:
+        raise LawError(str(error)) from error
+
+
+def _known(name: str, known: list[str]) -> str:
+    if not known:
+        return "it takes none"
+    near = did_you_mean(name, known)
+    return f"{near} (known: {', '.join(known)})" if near.startswith("did") else near

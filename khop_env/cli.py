@@ -6,9 +6,12 @@ or a run finds the observers' guarantee broken, or 2 for a mistake in what was a
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import json
+import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,8 +70,22 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.
 
 
 def main() -> None:
-    """Run the command line."""
-    app()
+    """Run the command line; where stdout can't be written to, say so in one line, and not at all to a closed pipe."""
+    try:
+        app()
+    except BrokenPipeError:
+        _drop_stdout()
+        raise SystemExit(2) from None
+    except OSError as error:
+        _drop_stdout()
+        say(f"khop: {error}")
+        raise SystemExit(2) from None
+
+
+def _drop_stdout() -> None:
+    """Send what is still buffered nowhere, so that the interpreter doesn't stumble over it when it ends."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @app.callback(invoke_without_command=True)
@@ -104,8 +121,10 @@ def check(name: ScenarioArgument, as_json: JsonOption = False) -> None:
     """
     from khop_env.results import design_report
 
-    with _mistakes(), waiting(f"designing the observers of {name}"):
+    with _mistakes(name), waiting(f"designing the observers of {name}"):
         report = design_report(_load(name))
+    if report["error"] is not None:
+        report["error"] = _in_words_of_the_file(name, report["error"])
     if as_json:
         _print_json(report)
     else:
@@ -139,11 +158,11 @@ def run(
     Exits with 1 if a funnel was left. Whatever was computed until then is written all the same.
     """
     from agents import make_law
-    from khop_env.results import record, summarize, write_run
+    from khop_env.results import RunFileError, record, summarize, write_run
     from khop_env.simulation import Explicit, Proximal
 
     explicit = integrator is IntegratorOption.EXPLICIT
-    with _mistakes(), waiting(f"designing the observers of {name}"):
+    with _mistakes(name), waiting(f"designing the observers of {name}"):
         scenario = _load(name)
         law = _law(scenario, controller)
         if explicit and order is OrderOption.TWO:
@@ -156,7 +175,7 @@ def run(
                 raise ValueError(f"{option} must be positive and finite; got {value!r}")
         simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
         simulator.reset(seed)
-        folder = out or Path("runs") / (re.sub(r"[^\w.-]+", "_", scenario.name) or "scenario")
+        folder = out or Path("runs") / _folder_name(scenario.name)
         folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost
     with Progress(f"simulating {scenario.name}") as progress:
         recording = record(simulator, duration, dt, progress=progress)
@@ -169,8 +188,12 @@ def run(
         controller=law.name,
         observe=observe.value,
     )
+    unwritten: RunFileError | None = None
     with _mistakes(), waiting(f"writing {folder}"):
-        files = write_run(recording, scenario, summary, folder)
+        try:
+            files = write_run(recording, scenario, summary, folder)
+        except RunFileError as error:
+            files, unwritten = error.written, error
     if as_json:
         _print_json({**summary, "files": {key: str(path) for key, path in files.items()}})
     else:
@@ -179,6 +202,9 @@ def run(
         print_summary(summary, files)
     if recording.error is not None:
         say(f"khop: {recording.error}")
+    if unwritten is not None:
+        say(f"khop: {unwritten}")
+        raise typer.Exit(2)
     if not summary["funnel_kept"]:
         raise typer.Exit(1)
 
@@ -214,13 +240,30 @@ def bench(
 
 
 @contextmanager
-def _mistakes() -> Iterator[None]:
-    """Tell of a mistake in what was asked in one paragraph, without a traceback."""
+def _mistakes(name: str | None = None) -> Iterator[None]:
+    """Tell of a mistake in what was asked in one paragraph, without a traceback; `name` is the scenario's."""
     try:
         yield
     except (ValueError, OSError) as error:
-        say(f"khop: {error}")
+        from khop_env.observers import DesignError
+
+        in_file = name is not None and isinstance(error, DesignError)
+        say(f"khop: {_in_words_of_the_file(str(name), str(error)) if in_file else error}")
         raise typer.Exit(2) from None
+
+
+def _in_words_of_the_file(name: str, message: str) -> str:
+    """What is wrong with a design, as one who edits a scenario file knows it; unchanged for scenarios by name."""
+    if not name.endswith(".toml"):
+        return message
+    for value in ("True", "False"):
+        message = message.replace(f"input_observer={value}", f"input_observer = {value.lower()}")
+    return f"{name}: {message}"
+
+
+def _folder_name(scenario_name: str) -> str:
+    """A scenario's name as that of one visible folder."""
+    return re.sub(r"[^\w.-]+", "_", scenario_name).lstrip(".") or "scenario"
 
 
 def _load(name: str) -> Scenario:
@@ -229,15 +272,16 @@ def _load(name: str) -> Scenario:
     Raises:
         ValueError: if there is no such scenario, file or law.
     """
-    from agents import LAWS, make_law
+    from agents import LAWS, LawError, make_law
     from khop_env.registry import scenario
     from khop_env.scenarios.files import read_scenario
 
     found = read_scenario(name, laws=LAWS) if name.endswith(".toml") else scenario(name)
     try:
         make_law(found.law)
-    except ValueError as error:
-        raise ValueError(f"{name}: law: {error}") from error
+    except LawError as error:
+        key = "law" if error.parameter is None else f"law.{error.parameter}"
+        raise ValueError(f"{name}: {key}: {error}") from error
     return found
 
 

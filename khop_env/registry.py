@@ -66,6 +66,8 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
         return read_scenario(text)
     name, _, given = text.partition(":")
     if name not in SCENARIOS:
+        if text.lower().endswith(".toml") or Path(text).is_file():
+            raise ValueError(f"no scenario {text!r}; if it is a scenario file, rename it: such a name ends in .toml")
         raise ValueError(f"no scenario {name!r}; {did_you_mean(name, SCENARIOS)} (A file's name ends in .toml.)")
     factory = SCENARIOS[name]
     known = inspect.signature(factory).parameters

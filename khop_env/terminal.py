@@ -108,14 +108,26 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
         typer.echo(f"guarantee not kept: stopped at t = {summary['duration']:.6g} s; until then largest {ratios}")
     else:
         typer.echo(f"guarantee not kept: largest {ratios} (should be below 1)")
-    typer.echo(f"consensus error at the end: {summary['final_consensus_error']:.4g} m")
+    error = summary["final_consensus_error"]
+    typer.echo(f"consensus error at the end: {'not finite' if error is None else f'{error:.4g} m'}")
+    if summary["diverged"]:
+        typer.echo(
+            "the states grew without bound: it seems that the plant diverged; try a smaller --dt, or another law"
+        )
     typer.echo(f"wall time: {summary['wall_time_s']:.3g} s for {summary['steps']} steps")
-    typer.echo(f"tables: {files['estimates']}, {files['states']}; summary: {files['summary']}")
-    typer.echo(f"figure: {files['figure']}")
+    tables = ", ".join(str(files[name]) for name in ("estimates", "states") if name in files)
+    for what, where in (("tables", tables), ("summary", files.get("summary")), ("figure", files.get("figure"))):
+        if where:
+            typer.echo(f"{what}: {where}")
 
 
-def _ratio(value: float) -> str:
-    return f"{value:.3f}"
+def _ratio(value: float | None) -> str:
+    """Three decimals, or as many as tell it from 1."""
+    if value is None:
+        return "not finite"
+    if value >= 1e4:
+        return f"{value:.4g}"
+    return next((text for d in range(3, 17) if float(text := f"{value:.{d}f}") != 1.0), "1.000")
 
 
 def print_design(report: Mapping[str, Any]) -> None:
@@ -148,7 +160,9 @@ def print_design(report: Mapping[str, Any]) -> None:
         rows = [(one["number"], one["status"], one["statement"], one["why"]) for one in report["assumptions"]]
         print_table(("", "status", "assumption of the paper", "why"), rows)
     if report["feasible"]:
-        typer.echo("feasible: every condition of the observers holds")
+        shares = [group["start_share"] for target in targets for kind in ("state", "input") for group in target[kind]]
+        later = "; where |g| is unbounded, a run checks at its start that inputs begin inside" if None in shares else ""
+        typer.echo(f"feasible: every condition of the observers holds{later}")
     else:
         typer.echo(f"not feasible: {report['error']}")
 
@@ -171,7 +185,7 @@ def _target_rows(target: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
                 f"{bound} {_span(group[bound])}",
                 f"{funnel} {_span(group[funnel])}",
                 "" if group[funnel]["rate"] is None else f"{group[funnel]['rate']:g}",
-                "unbounded: no" if share is None else f"{share:.3f}{'' if share < 1.0 else ': no'}",
+                "seen at reset" if share is None else f"{_ratio(share)}{'' if share < 1.0 else ': no'}",
             )
             first = ("", "", "", "")
 
@@ -183,7 +197,8 @@ def _span(function: Mapping[str, float | None]) -> str:
 def _all_targets(targets: Sequence[Mapping[str, Any]]) -> str:
     etas = [target["eta"] for target in targets]
     shares = [group["start_share"] for target in targets for kind in ("state", "input") for group in target[kind]]
-    worst = "unbounded" if None in shares else f"{max(shares, default=0.0):.3f}"
+    worst = _ratio(max((share for share in shares if share is not None), default=0.0))
+    worst += " (where |g| is bounded)" if None in shares else ""
     return (
         f"... and {len(targets) - SHOWN_TARGETS} more (--json has all). Over all {len(targets)}: eta {min(etas)} to "
         f"{max(etas)}, lambda_min from {min(target['lambda_min'] for target in targets):.4g}, lambda_max to "

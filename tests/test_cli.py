@@ -1,5 +1,7 @@
+import itertools
 import json
 import os
+import re
 import subprocess
 import sys
 import types
@@ -10,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import khop_env
-from khop_env import __version__, terminal
+from khop_env import __version__
 from khop_env.cli import app
 
 
@@ -84,8 +86,20 @@ class TestCheck:
         text = khop("export", "paper").stdout
         start, stop = text.index("[theta]"), text.index("# Disturbances")
         (folder / "bare.toml").write_text(text[:start] + text[stop:])
-        assert "not feasible: theta is missing" in khop("check", "bare.toml", status=1).stdout
-        assert "theta is missing" in refused("run", "bare.toml")
+        assert "not feasible: bare.toml: theta is missing" in khop("check", "bare.toml", status=1).stdout
+        assert only_json(khop("check", "bare.toml", "--json", status=1))["error"].startswith("bare.toml: theta")
+        said = refused("run", "bare.toml")
+        assert said.startswith("khop: bare.toml: theta is missing")
+        assert said.endswith("set input_observer = false")  # as one writes it in a file
+
+    def test_unlimited_inputs_are_left_to_the_start_as_a_run_does(self, folder):
+        text = khop("export", "paper").stdout
+        (folder / "free.toml").write_text(re.sub(r"input_limit = .*", "input_limit = inf", text))
+        found = khop("check", "free.toml").stdout
+        assert "inf" not in found.replace("feasible", "").replace("infinity", "").replace("inf)", "")
+        assert "seen at reset" in found
+        assert "a run checks at its start that inputs begin inside" in found
+        assert only_json(khop("run", "free.toml", "--duration", "0.05", "--json"))["funnel_kept"] is True
 
 
 class TestRun:
@@ -171,6 +185,54 @@ class TestRun:
         assert found["funnel_kept"] is False
         assert "left the funnel" in found["error"]
 
+    def test_a_plant_that_diverges_loses_nothing(self, folder):
+        """Vessels that all hear each other, in steps far too long: the states overflow, and that is told."""
+        lines = 'name = "vessels"\nk = 2\n[[agents]]\nmodel = "vessel"\ncount = 4\n'
+        edges = f"edges = {[list(edge) for edge in itertools.combinations(range(4), 2)]}\n"
+        bound = "initial = 10\nfinal = 1\nrate = 5\n"
+        (folder / "vessels.toml").write_text(
+            f"{lines}[communication]\n{edges}[task]\n{edges}[delta]\n{bound}[theta]\n{bound}"
+        )
+        arguments = ["run", "vessels.toml", "--dt", "3", "--duration", "60"]
+        result = khop(*arguments, status=1)
+        assert "the plant diverged" in result.stdout
+        assert "Warning" not in result.stderr
+        assert len(list((folder / "runs" / "vessels").iterdir())) == 4
+        found = only_json(khop(*arguments, "--json", status=1))
+        assert found["funnel_kept"] is False
+        assert found["diverged"] is True
+
+    def test_a_file_that_cannot_be_written_is_told_after_the_summary(self, folder):
+        (folder / "out" / "figure.png").mkdir(parents=True)
+        result = khop("run", "paper", "--duration", "0.05", "--out", "out", status=2)
+        assert "guarantee kept" in result.stdout
+        assert "summary: out/summary.json" in result.stdout
+        assert "khop: couldn't write out/figure.png" in result.stderr
+
+    @pytest.mark.parametrize(("name", "expected"), [("..", "scenario"), ("../../x", "_.._x"), (".hidden", "hidden")])
+    def test_the_folder_stays_within_runs(self, folder, name, expected):
+        (folder / "mine.toml").write_text(khop("export", "paper").stdout.replace('"paper"', f'"{name}"'))
+        khop("run", "mine.toml", "--duration", "0.02")
+        assert [path.name for path in folder.iterdir() if path.is_dir()] == ["runs"]
+        assert [path.name for path in (folder / "runs").iterdir()] == [expected]
+
+    @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that Linux has")
+    def test_stdout_that_is_full_is_one_line(self, folder):
+        environment = {**os.environ, "PYTHONPATH": str(Path(khop_env.__file__).parents[1])}
+        for arguments in (["list"], ["export", "paper"], ["run", "paper", "--duration", "0.02"]):
+            with open("/dev/full", "w") as full:
+                done = subprocess.run(
+                    [sys.executable, "-m", "khop_env", *arguments],
+                    env=environment,
+                    stdout=full,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
+            lines = [line for line in done.stderr.splitlines() if not line.startswith("khop_env: compiling")]
+            assert done.returncode == 2
+            assert len(lines) == 1
+            assert "No space left" in lines[0]
+
     def test_refusals(self, folder):
         assert "no scenario 'papr'; did you mean 'paper'?" in refused("run", "papr")
         assert "no law 'tan'; did you mean 'tanh'?" in refused("run", "paper", "--controller", "tan")
@@ -198,7 +260,13 @@ class TestExport:
         ("old", "new", "said"),
         [
             ('name = "tanh"', 'name = "tan"', "law.name: got 'tan', expected one of 'tanh'; did you mean 'tanh'?"),
-            ("gain = 2.0", "gian = 2.0", "mine.toml: law: law 'tanh' doesn't take"),
+            (
+                "gain = 2.0",
+                "gian = 2.0",
+                "mine.toml: law.gian: law 'tanh' has no parameter 'gian'; did you mean 'gain'?",
+            ),
+            ("gain = 2.0", 'gain = "high"', "mine.toml: law.gain: gain of law 'tanh' must be a number; got 'high'"),
+            ("gain = 2.0", "gain = inf", "mine.toml: law: the gain of the tanh law must be positive and finite"),
             ("gain = 2.0", "gain = -2.0", "mine.toml: law: the gain of the tanh law must be positive"),
         ],
     )
@@ -229,29 +297,6 @@ class TestBench:
 
     def test_json(self):
         assert only_json(khop("bench", "--json", "--quick"))["quick"] is True
-
-
-class TestProgress:
-    @pytest.fixture
-    def clock(self, monkeypatch):
-        now = [0.0]
-        monkeypatch.setattr(terminal.time, "perf_counter", lambda: now[0])
-        return now
-
-    def test_short_work_shows_no_bar(self, clock):
-        with terminal.Progress("work") as progress:
-            clock[0] = 1.0
-            progress(0.6)
-            assert progress._bar is None
-
-    def test_long_work_shows_one_early(self, clock):
-        with terminal.Progress("work") as progress:
-            clock[0] = 0.4
-            progress(0.001)
-            assert progress._bar is None
-            clock[0] = 0.6
-            progress(0.1)
-            assert progress._bar is not None
 
 
 def test_version():

@@ -32,12 +32,44 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f"known: {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}"
 
 
+_PROBES = 8  # random inputs at which it is seen whether g is affine in each input
+
+
+def require_shape(model: AgentModel, value: FloatArray, shape: tuple[int, ...], what: str) -> FloatArray:
+    """What a model's right-hand side returned, as an array.
+
+    Args:
+        model: whose it is.
+        value: what it returned.
+        shape: what it should have.
+        what: the function and its arguments, for the error message.
+
+    Raises:
+        ValueError: The shape is another.
+    """
+    if np.shape(value) != shape:
+        raise ValueError(
+            f"{model.__class__.__name__}.{what} returned shape {np.shape(value)}, expected {shape}: the leading "
+            f"axes of x, then the {model.n} states {tuple(model.states)}"
+        )
+    return np.asarray(value)
+
+
+def _same(one: FloatArray, other: FloatArray) -> bool:
+    """Whether rates (K, n) agree, to rounding of the largest of each component."""
+    scale = np.maximum(np.abs(one), np.abs(other)).max(axis=0)
+    return not bool(np.any(np.abs(one - other) > 1e-9 * scale))
+
+
 class AgentModel:
     """Base class of agent models: name the states and inputs, then write `drift` and `input_map`.
 
     A subclass sets the attributes below, on the class or on the instance. One that writes its own `__init__` ends
     it with `super().__init__()`, which checks them. Models of equal class and equal parameters are equal, and a fleet
     evaluates neighbours that are equal in one call.
+
+    Right-hand sides take time without an axis for the states: t has shape (B, 1) where x has (B, N, n). Next to
+    x[..., 0] write t, next to x itself t[..., None].
 
     Attributes:
         type: What its agents are called, e.g. "unicycle" for "unicycle_0"; lower-case letters, digits and underscores.
@@ -66,7 +98,7 @@ class AgentModel:
         """f_i: the state's rate of change without input or disturbance.
 
         Args:
-            t: Time in seconds, of a shape that broadcasts against x[..., 0].
+            t: Time in seconds, of a shape that broadcasts against x[..., 0]: (B, 1) beside an x of shape (B, N, n).
             x: States, shape (..., n).
 
         Returns:
@@ -78,7 +110,7 @@ class AgentModel:
         """g_i: what the input adds to the state's rate of change.
 
         Args:
-            t: Time in seconds, of a shape that broadcasts against x[..., 0].
+            t: Time in seconds, of a shape that broadcasts against x[..., 0]: (B, 1) beside an x of shape (B, N, n).
             x: States, shape (..., n).
             u: Inputs, shape (..., m).
 
@@ -94,18 +126,67 @@ class AgentModel:
     def input_map_bound(self) -> FloatArray:
         """Bound on each component of |g_i| over all states and all inputs within their limits, shape (n,).
 
-        This default is the largest |g| over the corners of the input box at t = 0 and x = 0. It is exact where g is
-        affine in each input and depends on nothing else; a model with any other g overrides it. A component that
-        depends on an unlimited input has the bound inf.
+        This default is the largest |g| over the corners of the input box, with inf for what depends on an unlimited
+        input. It is right where g is affine in each input and depends on nothing else. A model with any other g
+        overrides it, with np.inf for a component that has no bound.
+
+        Raises:
+            ValueError: g is seen to depend on the state, on time, or on inputs in another way, so that its values at
+                the corners say nothing of the others.
         """
-        box = np.where(np.isfinite(self.input_limit), self.input_limit, 1.0)
-        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=self.m)))
-        corners = np.asarray(self.input_map(np.zeros(len(signs)), np.zeros((len(signs), self.n)), signs * box))
-        bound = np.abs(corners).max(axis=0)
-        for j in np.flatnonzero(np.isinf(self.input_limit)):
-            low, high = corners[signs[:, j] < 0], corners[signs[:, j] > 0]  # in one order: they differ in u_j only
+        corners = np.array(list(itertools.product((-1.0, 1.0), repeat=self.m)))
+        unlimited = np.isinf(self.input_limit)
+        box = np.where(unlimited, 1.0, self.input_limit)
+        at_corners = self._probe(0.0, np.zeros(self.n), corners * box)
+        bound = np.abs(at_corners).max(axis=0)
+        why = "depends on the state" if self.input_map_uses_state else None
+        rng = np.random.default_rng(0)
+        inside = rng.uniform(-1.0, 1.0, (_PROBES, self.m))
+        at_inside = self._probe(0.0, np.zeros(self.n), inside * box)
+        if not _same(self._probe(rng.uniform(1.0, 100.0), np.zeros(self.n), inside * box), at_inside):
+            why = "depends on time"
+        weights = (1.0 + corners * inside[:, None]).prod(axis=-1) / 2.0**self.m
+        if not _same(at_inside, weights @ at_corners):
+            why = why or "isn't affine in each input"
+        if why is not None:
+            raise ValueError(
+                f"{self.__class__.__name__}.input_map {why}, so that its bound can't be found by trying: write "
+                f"input_map_bound(self), returning the largest |g| of each of the {self.n} states' rates over all "
+                "states, times and inputs within their limits as an array, with np.inf where there is none"
+            )
+        for j in np.flatnonzero(unlimited):
+            low, high = at_corners[corners[:, j] < 0], at_corners[corners[:, j] > 0]  # in one order: they differ in u_j
             bound[(low != high).any(axis=0)] = np.inf
         return bound
+
+    def checked_input_map_bound(self) -> FloatArray:
+        """`input_map_bound`, after checks of what can be seen of the input map and of the bound itself.
+
+        Raises:
+            ValueError: The input map returns a wrong shape, or depends on the state without saying so; or the bound is
+                misshapen, negative or not a number.
+        """
+        who, rng = self.__class__.__name__, np.random.default_rng(0)
+        u = np.tile(rng.uniform(-1.0, 1.0, self.m) * np.minimum(self.input_limit, 1.0), (2, 1))
+        g = self._probe(0.0, rng.normal(size=(2, self.n)), u)
+        if not self.input_map_uses_state and not _same(g[:1], g[1:]):
+            raise ValueError(
+                f"{who}.input_map depends on the state: set input_map_uses_state = True, and write input_map_bound. "
+                "Such an agent has no input observer (Theorem 3 is about g(u)), and its g has to be bounded"
+            )
+        bound = np.asarray(self.input_map_bound(), dtype=np.float64)
+        if bound.shape != (self.n,) or not (bound >= 0.0).all():
+            raise ValueError(
+                f"{who}.input_map_bound() must return {self.n} numbers that aren't negative, one for each state "
+                f"{tuple(self.states)}; got {bound}"
+            )
+        return bound
+
+    def _probe(self, t: float, x: FloatArray, u: FloatArray) -> FloatArray:
+        """Values of g at some inputs (K, m), called as a simulator does: with one environment of K agents."""
+        states = np.broadcast_to(x, (1, len(u), self.n)).copy()
+        g = self.input_map(np.full((1, 1), t), states, u[None].copy())
+        return require_shape(self, g, states.shape, "input_map(t, x, u)")[0]
 
     @property
     def n(self) -> int:

@@ -14,7 +14,7 @@ from typing import SupportsIndex
 
 import numpy as np
 
-from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean
+from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean, require_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +67,8 @@ class Fleet:
         input_map_bound: Bounds on the components of |g|, shape (n,).
 
     Raises:
-        ValueError: There are no models, one isn't a model, positions differ in dimension, or agents of one type differ
-            in their states or inputs.
+        ValueError: There are no models, one isn't a model, positions differ in dimension, agents of one type differ
+            in their states or inputs, or an input map is misshapen or not what its model says of it.
     """
 
     def __init__(self, models: Sequence[AgentModel]) -> None:
@@ -95,7 +95,7 @@ class Fleet:
         self.position_index: IndexArray = np.array(positions) + self.state_offset[:-1, None]
         self.input_limit: FloatArray = np.concatenate([model.input_limit for model in self.models])
         self.input_map_bound: FloatArray = np.concatenate(
-            [np.tile(group.model.input_map_bound(), group.size) for group in self.groups]
+            [np.tile(group.model.checked_input_map_bound(), group.size) for group in self.groups]
         )
 
     def __len__(self) -> int:
@@ -198,12 +198,7 @@ class Fleet:
 
 def _fill(out: FloatArray, group: Group, value: FloatArray, shape: tuple[int, ...], what: str) -> None:
     # A copy even for a single group: a model may return its argument (g = u) and callers add into `out`.
-    if np.shape(value) != shape:
-        raise ValueError(
-            f"{group.model.__class__.__name__}.{what} returned shape {np.shape(value)}, expected {shape}: the leading "
-            f"axes of x, then the {group.model.n} states {tuple(group.model.states)}"
-        )
-    out[:, group.state_slice].reshape(shape)[...] = value
+    out[:, group.state_slice].reshape(shape)[...] = require_shape(group.model, value, shape, what)
 
 
 def _offsets(sizes: list[int]) -> IndexArray:

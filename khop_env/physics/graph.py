@@ -62,7 +62,11 @@ def hop_distances(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
 
     Returns:
         For each agent, {agent: distance} of the agents within `cutoff` hops, itself included at 0, nearest first.
+
+    Raises:
+        ValueError: The cutoff isn't an integer.
     """
+    _require_hops(cutoff)
     neighbors = [list(graph.adj[node]) for node in range(len(graph))]
     distances = []
     for source in range(len(neighbors)):
@@ -75,6 +79,8 @@ def hop_distances(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
                     if neighbor not in found:
                         found[neighbor] = hops
                         reached.append(neighbor)
+            if not reached:
+                break
             frontier = reached
         distances.append(found)
     return distances
@@ -93,8 +99,9 @@ def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[
         For each agent, sorted: the agents at distance 2..k, or 1..k without relay.
 
     Raises:
-        ValueError: k leaves nothing to estimate: below 2, or below 1 without relay.
+        ValueError: k isn't an integer, or leaves nothing to estimate: below 2, or below 1 without relay.
     """
+    _require_hops(k)
     nearest = 2 if relay else 1
     if k < nearest:
         raise ValueError(f"k must be at least {nearest} {'with' if relay else 'without'} relay; got {k!r}")
@@ -198,6 +205,11 @@ def _squared_distances(a: FloatArray, b: FloatArray) -> FloatArray:
     x = a[:, None, 0] - b[:, 0]
     y = a[:, None, 1] - b[:, 1]
     return np.asarray(x * x + y * y)
+
+
+def _require_hops(k: object) -> None:
+    if isinstance(k, bool | np.bool) or not isinstance(k, int | np.integer):
+        raise ValueError(f"k must be an integer, a number of hops; got {k!r}")
 
 
 def _distance(graph: nx.Graph, a: int, b: int) -> str:

@@ -6,12 +6,13 @@ from khop_env.results.metrics import consensus_error, summarize
 from khop_env.results.recording import ObserverRecord, Recording, record
 from khop_env.results.report import design_report
 from khop_env.results.tables import estimates_table, states_table
-from khop_env.results.writing import write_run
+from khop_env.results.writing import RunFileError, write_run
 
 __all__ = [
     "Assumption",
     "ObserverRecord",
     "Recording",
+    "RunFileError",
     "assumptions",
     "consensus_error",
     "design_report",

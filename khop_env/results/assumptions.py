@@ -10,7 +10,7 @@ from typing import Literal
 import networkx as nx
 import numpy as np
 
-from khop_env.observers import FloatArray, FunnelBank, Funnels
+from khop_env.observers import Exponential, FloatArray, FunnelBank, Funnels
 from khop_env.physics import DriftingIntegrator, SingleIntegrator
 from khop_env.scenarios import Scenario
 
@@ -96,15 +96,20 @@ def _bounded_disturbance(scenario: Scenario) -> Assumption:
     if scenario.disturbance is None:
         return Assumption("1-iii", statement, "holds", "w = 0")
     bound = scenario.disturbance.attach(scenario.fleet).bound
-    kinds = _listed(sorted({type(term).__name__ for term in scenario.disturbance.terms}))
-    return Assumption(
-        "1-iii", statement, "holds", f"|w| <= {bound.max():.4g} in every component, as declared by {kinds}, all smooth"
-    )
+    terms = scenario.disturbance.terms
+    kinds = _listed(sorted({type(term).__name__ for term in terms}))
+    own = sorted({type(term).__name__ for term in terms if not type(term).__module__.startswith("khop_env.")})
+    why = f"|w| <= {bound.max():.4g} in every component, as declared by {kinds}"
+    if own:
+        return Assumption(
+            "1-iii", statement, "not known", f"{why}; {_listed(own)}: your own, continuous and within it if you say so"
+        )
+    return Assumption("1-iii", statement, "holds", f"{why}, all smooth")
 
 
 def _input_map(scenario: Scenario) -> Assumption:
     fleet, options = scenario.fleet, scenario.design.options
-    bounded = sum(model.input_map_bounded for model in fleet.models)
+    bounded = int(np.logical_and.reduceat(np.isfinite(fleet.input_map_bound), fleet.state_offset[:-1]).sum())
     observed = sum(option.input_observer for option in options)
     why = [f"(i) g is bounded for {bounded} of {len(fleet)} agents"]
     if bounded:
@@ -176,14 +181,11 @@ def _steady_state_bound(scenario: Scenario) -> Assumption:
         return Assumption("6", statement, "holds by construction", "nobody is estimated")
     rows = states.layout.plan[states.layout.row_target, 0].astype(float)  # how many observers share each row's delta
     floor = float(np.sqrt(rows @ states.delta.infimum() ** 2))
-    time = _first_time_below(lambda t: _norm(states, rows, t), _MARGIN * floor)
+    own = sorted({type(one).__name__ for one in states.bounds if not isinstance(one, Exponential)})
+    time = None if own else _first_time_below(lambda t: _norm(states, rows, t), _MARGIN * floor)
     if time is None:
-        return Assumption(
-            "6",
-            statement,
-            "not known",
-            f"the norm of all infima is {floor:.4g}; your own delta decides when it comes near",
-        )
+        why = f"whether all come near it is for your own {_listed(own)} to say" if own else "they take more than a year"
+        return Assumption("6", statement, "not known", f"the norm of all infima is {floor:.4g}; {why}")
     return Assumption(
         "6",
         statement,

@@ -46,7 +46,7 @@ def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, age
 
     shown = _default_agent(recording, scenario) if agent is None else recording.fleet.agent(agent)
     name = recording.fleet.ids[shown]
-    with rc_context(_STYLE):
+    with rc_context(_STYLE), np.errstate(all="ignore"):  # of states that ran away, what is finite is drawn
         figure = Figure(figsize=(13.0, 4.4), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         _draw_positions(left, recording)
@@ -80,12 +80,13 @@ def _default_agent(recording: Recording, scenario: Scenario) -> int:
 
 def _headline(recording: Recording, scenario: Scenario) -> str:
     extremes = recording.extremes
-    ratios = max(float(extremes.normalized[0]), float(extremes.input_normalized[0]))
+    ratios = float(np.maximum(extremes.normalized, extremes.input_normalized)[0])  # nan if one is
     over = f"over all {recording.design.states.layout.pairs} pairs"
     if recording.error is not None:
         return f"{scenario.name}: stopped at t = {recording.time[-1]:.4g} s, {_reason(recording)}"
     kept = "inside all funnels" if ratios < 1.0 else "funnels left"
-    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {ratios:.3f} {over}"
+    digits = f"{ratios:.3f}" if round(ratios, 3) != 1.0 else f"{ratios:.12g}"  # never 1.000 where it isn't 1
+    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {digits} {over}"
 
 
 def _reason(recording: Recording) -> str:
@@ -170,7 +171,7 @@ def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agen
         shown, error, disagreement = "max over observers, components", error.max(axis=1), disagreement.max(axis=1)
         rho, delta = rho[:, 0], delta[:, 0]
     else:
-        worst = int(np.argmax((error / delta).max(axis=0)))
+        worst = int(np.argmax((error / delta).max(axis=0)))  # one that isn't a number counts as the largest
         shown = f"{names[worst]}: max over observers"
         units = [units[worst]]
         error, disagreement, rho, delta = (values[:, worst] for values in (error, disagreement, rho, delta))
@@ -196,7 +197,7 @@ def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agen
 def _lowest(error: FloatArray, disagreement: FloatArray, rho: FloatArray) -> float:
     """Lower end of the logarithmic axis: dips of a moment and rounding errors don't stretch it over many decades."""
     values = np.concatenate([error, disagreement])
-    values = values[values > 0.0]
+    values = values[(values > 0.0) & np.isfinite(values)]
     floor = 1e-6 * float(rho.min())
     return max(floor, float(np.quantile(values, 0.02)) / 3.0) if values.size else floor
 

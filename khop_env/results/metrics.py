@@ -15,6 +15,8 @@ from khop_env.results.recording import Recording
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Integrator, Observe
 
+_ABSURD = 1e6  # times the largest initial state: no task sends agents so far away
+
 
 def consensus_error(fleet: Fleet, x: FloatArray) -> FloatArray:
     """(...,) |Pi p|: how far the agents' positions p are from agreement, in m.
@@ -27,7 +29,19 @@ def consensus_error(fleet: Fleet, x: FloatArray) -> FloatArray:
         x: (..., n) their states.
     """
     positions = fleet.positions(x)
-    return np.asarray(np.linalg.norm(positions - positions.mean(axis=-2, keepdims=True), axis=(-2, -1)))
+    with np.errstate(over="ignore", invalid="ignore"):  # of states that ran away: inf or nan says it
+        return np.asarray(np.linalg.norm(positions - positions.mean(axis=-2, keepdims=True), axis=(-2, -1)))
+
+
+def _diverged(x: FloatArray) -> bool:
+    """Whether a state grew a million times as large as any at the beginning, and 1 of its unit."""
+    largest = _ABSURD * max(1.0, float(np.abs(x[0]).max()))
+    return not bool(np.all(np.abs(x) <= largest))
+
+
+def finite(value: float) -> float | None:
+    """A number as JSON has it: null where it is infinite or not a number."""
+    return float(value) if np.isfinite(value) else None
 
 
 def summarize(
@@ -44,7 +58,8 @@ def summarize(
 
     The two ratios are the paper's guarantee: below 1 over all pairs, components and steps, each disagreement stayed in
     its funnel and each estimation error within its bound. `funnel_kept` says that they are, for both kinds of
-    observers, and that the run got to its end.
+    observers, and that the run got to its end with every state finite. `diverged` hints at a plant that ran away.
+    Numbers that aren't finite are null.
 
     Args:
         recording: of the run.
@@ -56,9 +71,10 @@ def summarize(
         observe: what the law saw of agents out of earshot.
     """
     extremes = recording.extremes
-    state_ratios = [float(extremes.normalized[0]), float(extremes.relative[0])]
-    input_ratios = [float(extremes.input_normalized[0]), float(extremes.input_relative[0])]
+    state_ratios = [extremes.normalized[0], extremes.relative[0]]
+    input_ratios = [extremes.input_normalized[0], extremes.input_relative[0]]
     has_inputs = recording.design.inputs.layout.size > 0
+    kept = all(ratio < 1.0 for ratio in (*state_ratios, *input_ratios)) and bool(np.all(np.isfinite(recording.x)))
     return {
         "scenario": scenario.name,
         "controller": controller,
@@ -73,12 +89,13 @@ def summarize(
         "wall_time_s": recording.wall_time,
         "agents": len(recording.fleet),
         "pairs": recording.design.states.layout.pairs,
-        "max_normalized_disagreement": state_ratios[0],
-        "max_error_to_bound": state_ratios[1],
-        "max_normalized_disagreement_input": input_ratios[0] if has_inputs else None,
-        "max_error_to_bound_input": input_ratios[1] if has_inputs else None,
-        "final_consensus_error": float(consensus_error(recording.fleet, recording.x[-1])),
-        "funnel_kept": recording.completed and max(*state_ratios, *input_ratios) < 1.0,
+        "max_normalized_disagreement": finite(state_ratios[0]),
+        "max_error_to_bound": finite(state_ratios[1]),
+        "max_normalized_disagreement_input": finite(input_ratios[0]) if has_inputs else None,
+        "max_error_to_bound_input": finite(input_ratios[1]) if has_inputs else None,
+        "final_consensus_error": finite(float(consensus_error(recording.fleet, recording.x[-1]))),
+        "diverged": _diverged(recording.x),
+        "funnel_kept": recording.completed and kept,
         "error": None if recording.error is None else str(recording.error),
         "versions": {
             "khop_env": khop_env.__version__,

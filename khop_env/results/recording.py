@@ -49,7 +49,8 @@ class ObserverRecord:
     @property
     def error(self) -> FloatArray:
         """(T, P) estimation errors x_tilde, or g_tilde."""
-        return self.estimate - self.truth_per_estimate
+        with np.errstate(invalid="ignore"):  # inf - inf, of states that ran away, is nan
+            return self.estimate - self.truth_per_estimate
 
     @property
     def rho(self) -> FloatArray:
@@ -145,28 +146,28 @@ def record(
     most_samples = max(2, MOST_ROWS // width)
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
     samples = _Samples(simulator, 1 + math.ceil(steps / stride))
-    _warm_up(simulator)
-
     error: FunnelError | SolveError | None = None
-    start = shown = clock.perf_counter()
-    samples.take()
-    done = 0
-    try:
-        for k in range(1, steps + 1):
-            until = duration if k == steps else round(k * dt, _TIME_DECIMALS)
-            simulator.step(until - float(simulator.t[0]))
-            done = k
-            if k % stride == 0 or k == steps:
+    with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError does, and a summary says what ran away
+        _warm_up(simulator)
+        start = shown = clock.perf_counter()
+        samples.take()
+        done = 0
+        try:
+            for k in range(1, steps + 1):
+                until = duration if k == steps else round(k * dt, _TIME_DECIMALS)
+                simulator.step(until - float(simulator.t[0]))
+                done = k
+                if k % stride == 0 or k == steps:
+                    samples.take()
+                if progress is not None and (now := clock.perf_counter()) - shown > 0.1:
+                    shown = now
+                    progress(k / steps)
+        except FunnelError as left:  # the state is the last one inside the funnel: worth keeping
+            error = left
+            if done % stride:
                 samples.take()
-            if progress is not None and (now := clock.perf_counter()) - shown > 0.1:
-                shown = now
-                progress(k / steps)
-    except FunnelError as left:  # the state is the last one inside the funnel: worth keeping
-        error = left
-        if done % stride:
-            samples.take()
-    except SolveError as failed:  # the state is that of a step half done: not worth keeping
-        error = failed
+        except SolveError as failed:  # the state is that of a step half done: not worth keeping
+            error = failed
     wall_time = clock.perf_counter() - start
     if progress is not None and error is None:
         progress(1.0)

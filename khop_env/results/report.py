@@ -16,17 +16,19 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
     """Everything that the observers of a scenario rest on.
 
     Returns:
-        feasible: whether every condition of the observers holds; `error` says which doesn't.
+        feasible: whether every condition of the observers holds that can be checked before the start; `error` says
+            which doesn't.
         targets: per agent that is estimated: its k-hop set, eta, lambda_min and lambda_max of M_i, and under `state`
             and `input` per group of components with equal numbers: delta and rho (theta and omega), each with its
             value at 0 and at infinity and its rate, and start_share, the largest |xi(0)| / rho(0) over the initial
-            set.
+            set; null where |g| is unbounded, so that only `Simulator.reset` can tell.
+        pairs: of observer and target; estimates: numbers that they estimate.
         explicit_step_bound_s: no explicit Euler step longer than this is stable at steady state (it has to be far
             shorter): the smallest over all targets, for both kinds of observers.
         assumptions: the paper's six, each with a status and why.
-        observers: agents whose observers use a simplification.
 
-    Numbers that are infinite or unknown are null.
+    Numbers that are infinite or unknown are null. All keys are there in any case: where the observers can't be
+    designed at all, what follows from a design is null, and targets and assumptions are empty.
     """
     report: dict[str, Any] = {
         "scenario": scenario.name,
@@ -37,14 +39,20 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         "relay": scenario.relay,
         "feasible": False,
         "error": None,
+        "pairs": None,
+        "estimates": None,
+        "explicit_step_bound_s": {"state": None, "input": None},
+        "targets": [],
+        "assumptions": [],
     }
     try:
         design = scenario.design
     except DesignError as error:
-        return {**report, "error": str(error), "targets": [], "assumptions": []}
-    radius = {"state": scenario.initial.radius, "input": scenario.fleet.input_map_bound}
-    try:
-        design.require_feasible_start(radius["state"], radius["input"])
+        return {**report, "error": str(error)}
+    bound = scenario.fleet.input_map_bound
+    radius = {"state": scenario.initial.radius, "input": bound}
+    try:  # as the simulator does: where g is unbounded, its reset checks where the inputs start
+        design.require_feasible_start(scenario.initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         report["feasible"] = True
     except DesignError as error:
         report["error"] = str(error)

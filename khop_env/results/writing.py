@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,24 @@ from khop_env.results.tables import estimates_table, states_table
 from khop_env.scenarios import Scenario
 
 
+class RunFileError(OSError):
+    """Some of a run's files couldn't be written; the message says which, and why.
+
+    Attributes:
+        written: The paths of those that were.
+    """
+
+    def __init__(self, message: str, written: dict[str, Path]) -> None:
+        super().__init__(message)
+        self.written = written
+
+
 def write_run(
     recording: Recording, scenario: Scenario, summary: Mapping[str, Any], folder: str | Path
 ) -> dict[str, Path]:
-    """Write `summary.json`, `states.parquet`, `estimates.parquet` and `figure.png`, over those of an earlier run.
+    """Write `states.parquet`, `estimates.parquet`, `summary.json` and `figure.png`, over those of an earlier run.
+
+    One that fails doesn't keep the others from being written, and none of an earlier run's stays in its place.
 
     Args:
         recording: of the run.
@@ -26,13 +41,33 @@ def write_run(
 
     Returns:
         The path of each file by its name without the ending.
+
+    Raises:
+        RunFileError: if some couldn't be written, after all others were.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    names = ("summary.json", "states.parquet", "estimates.parquet", "figure.png")
-    paths = {Path(name).stem: folder / name for name in names}
-    paths["summary"].write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    states_table(recording).write_parquet(paths["states"])
-    estimates_table(recording).write_parquet(paths["estimates"])
-    paper_figure(recording, scenario, paths["figure"])
-    return paths
+    writers: dict[str, Callable[[Path], object]] = {
+        "states.parquet": lambda path: states_table(recording).write_parquet(path),
+        "estimates.parquet": lambda path: estimates_table(recording).write_parquet(path),
+        "summary.json": lambda path: path.write_text(_json(summary), encoding="utf-8"),
+        "figure.png": lambda path: paper_figure(recording, scenario, path),
+    }
+    written, failures = {}, []
+    for name, write in writers.items():
+        path = folder / name
+        try:
+            write(path)
+        except Exception as error:  # whatever went wrong, the other files must not be lost
+            failures.append(f"{path} ({str(error) or type(error).__name__})")
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+        else:
+            written[path.stem] = path
+    if failures:
+        raise RunFileError(f"couldn't write {', '.join(failures)}", written)
+    return written
+
+
+def _json(summary: Mapping[str, Any]) -> str:
+    return json.dumps(summary, indent=2, allow_nan=False) + "\n"

@@ -138,7 +138,9 @@ def describe(expected: Any) -> str:
         return " or ".join(describe(one) for one in inside if one is not type(None))
     if origin is tuple:
         count = "" if inside[-1] is Ellipsis else f"{len(inside)} "
-        plural = {int: "integers", float: "numbers", str: "strings"}.get(inside[0], f"[{describe(inside[0])}]")
+        plural = {int: "integers", float: "numbers", str: "strings", Any: "lists"}.get(
+            inside[0], f"[{describe(inside[0])}]"
+        )
         return f"a list of {count}{plural}"
     return words.get(expected, "a number or a list")
 

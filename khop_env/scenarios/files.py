@@ -24,7 +24,7 @@ from khop_env.physics import (
     did_you_mean,
     validate_graph,
 )
-from khop_env.scenarios.checked import REQUIRED, CheckedTable, ScenarioFileError
+from khop_env.scenarios.checked import REQUIRED, CheckedTable, ScenarioFileError, fits
 from khop_env.scenarios.export import write_scenario
 from khop_env.scenarios.scenario import Bounds, LawChoice, Scenario
 
@@ -32,7 +32,7 @@ __all__ = ["ScenarioFileError", "read_scenario", "write_scenario"]
 
 _ABSENT: Any = object()
 _Made = TypeVar("_Made")
-_Edges = tuple[tuple[int, int], ...]
+_Edge = tuple[int, int]
 _Numbers = float | tuple[float, ...]
 _PerAgent = _Numbers | tuple[tuple[float, ...], ...]
 
@@ -154,11 +154,14 @@ def _shape(shape: tuple[int, ...]) -> str:
 
 
 def _graph(table: CheckedTable, agents: int, check: Callable[[nx.Graph], nx.Graph]) -> nx.Graph:
-    edges: _Edges = table.take("edges", _Edges)
+    edges = table.take("edges", tuple[Any, ...])
     table.finish()
     for i, edge in enumerate(edges):
-        if not all(0 <= agent < agents for agent in edge):
-            table.refuse(f"edges[{i}]", f"got {list(edge)}, expected two numbers of agents, from 0 to {agents - 1}")
+        if not fits(edge, _Edge) or not all(0 <= agent < agents for agent in edge):
+            got = list(edge) if isinstance(edge, tuple) else edge
+            table.refuse(f"edges[{i}]", f"got {got!r}, expected two numbers of agents, integers from 0 to {agents - 1}")
+        if edge[0] == edge[1]:
+            table.refuse(f"edges[{i}]", f"got {list(edge)}, but an agent can't be its own neighbour; remove it")
     graph = nx.Graph()
     graph.add_nodes_from(range(agents))
     graph.add_edges_from(edges)

@@ -27,10 +27,12 @@ def random_geometric(agents: int = 100, k: int = 2, seed: int = 0) -> Scenario:
         seed: of the positions, and of who is to agree with whom.
 
     Raises:
-        ValueError: for fewer than 4 agents or k below 2.
+        ValueError: for fewer than 4 agents, k below 2 or a negative seed.
     """
     if agents < 4:
         raise ValueError(f"random_geometric needs at least 4 agents; got agents={agents}")
+    if seed < 0:
+        raise ValueError(f"random_geometric needs a seed that isn't negative; got seed={seed}")
     rng = np.random.default_rng(seed)
     communication, _ = random_geometric_graph(agents, MEAN_DEGREE, rng)
     task = nx.Graph(nx.bfs_edges(communication, 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,7 +12,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.observers import Bound, Exponential, ObserverDesign, PerformanceFunction, TargetObservers
+from khop_env.observers import Bound, DesignError, Exponential, ObserverDesign, PerformanceFunction, TargetObservers
 from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
 from khop_env.simulation import InitialSet, Integrator, Law, Observe, Proximal, Simulator
 
@@ -89,8 +90,10 @@ class Scenario:
         if np.any(np.asarray(self.radius) < 0.0):
             raise ValueError(f"scenario {self.name!r}: radius must not be negative")
         for name in ("duration", "dt"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"scenario {self.name!r}: {name} must be positive; got {getattr(self, name)!r}")
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"scenario {self.name!r}: {name} must be positive and finite; got {getattr(self, name)!r}"
+                )
 
     def replace(self, **changes: Any) -> Scenario:
         """A copy with some attributes changed."""
@@ -111,9 +114,9 @@ class Scenario:
         """The observers: k-hop sets, matrices and funnels.
 
         Raises:
-            DesignError: if they can't be designed as asked.
+            DesignError: if they can't be designed as asked, or a bound of the user's own isn't one.
         """
-        return ObserverDesign(
+        design = ObserverDesign(
             self.fleet,
             self.communication,
             self.k,
@@ -122,11 +125,19 @@ class Scenario:
             self.relay,
             self.observers,
         )
+        for name, funnels in (("delta", design.states), ("theta", design.inputs)):
+            for bound in {id(one): one for one in funnels.bounds if not isinstance(one, Exponential)}.values():
+                _check_bound(bound, name)
+        return design
 
     def sized(self, margin: float = 1.25) -> Scenario:
         """A copy whose bounds start `margin` times as wide as the initial set needs; final values and rates stay.
 
-        Bounds given for all agents stay one function, bounds given by type get one per component.
+        Bounds given for all agents stay one function, bounds given by type get one per component. Where |g| is
+        unbounded, theta starts no lower than it is given here: `Simulator.reset` checks it.
+
+        Args:
+            margin: above 1.
 
         Raises:
             ValueError: if a bound isn't `Exponential`, or margin isn't above 1.
@@ -143,6 +154,8 @@ class Scenario:
             if bounds is None:
                 continue
             needed = margin * funnels.smallest_initial_bound(radius)
+            given = funnels.delta.evaluate(np.zeros(1), np.empty((len(needed), 1)))[:, 0]
+            needed = np.where(np.isfinite(needed), needed, given)  # nothing is known of an unbounded g
             if not isinstance(bounds, Mapping):
                 resized[name] = _widened(bounds, needed.max(initial=0.0))
                 continue
@@ -195,6 +208,28 @@ class Scenario:
             if key not in types:
                 raise ValueError(f"scenario {self.name!r}: {name} is given for {key!r}; {did_you_mean(key, types)}")
         return {i: bounds[model.type] for i, model in enumerate(self.models) if model.type in bounds}
+
+
+_SAMPLED_TIMES = np.concatenate([np.linspace(0.0, 10.0, 1001), np.geomspace(10.0, 1000.0, 1001)])  # s
+
+
+def _check_bound(bound: PerformanceFunction, name: str) -> None:
+    """Sample a function of the user's own: positive and finite, and not below the infimum that it declares.
+
+    Raises:
+        DesignError: with the time and the value.
+    """
+    values = np.broadcast_to(np.asarray(bound(_SAMPLED_TIMES), dtype=float), _SAMPLED_TIMES.shape)
+    floor = float(bound.infimum())
+    if not 0.0 < floor < math.inf:
+        raise DesignError(f"{name}: {bound!r}.infimum() must be positive and finite; got {floor!r}")
+    wrong = np.flatnonzero(~(np.isfinite(values) & (values >= floor * (1.0 - 1e-9))))
+    if wrong.size:
+        t, value = _SAMPLED_TIMES[wrong[0]], values[wrong[0]]
+        raise DesignError(
+            f"{name}: {bound!r} is {value:.6g} at t = {t:.4g} s, but its infimum() says that it is never below "
+            f"{floor:.6g}; return a lower bound on all its values, which have to be finite and positive (Definition 1)"
+        )
 
 
 def _widened(bound: PerformanceFunction, initial: float) -> Exponential:

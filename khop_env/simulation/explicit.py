@@ -159,5 +159,6 @@ def _left_funnel(
     return (
         f"the explicit step left the funnel: {kind} observer of {who} reached |{'e' if kind == 'state' else 'q'}| = "
         f"{largest:.4g} at t = {t[env] + dt:.6g} s with dt = {dt:g} s; just before, a step below "
-        f"{min(stable, dt):.2g} s would have been stable: take a shorter one, or the proximal integrator"
+        f"{min(stable, dt):.2g} s would have been stable, and at steady state it has to be far below "
+        f"{funnels.explicit_step_bound().min():.2g} s: take a shorter one, or the proximal integrator"
     )

@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from agents import LAWS, TanhConsensus, make_law, velocity_to_input
+from agents import LAWS, LawError, TanhConsensus, make_law, velocity_to_input
 from khop_env.physics import MODELS, AgentModel
 from khop_env.scenarios import LawChoice, mixed_fleet, paper
 
@@ -82,9 +82,18 @@ def test_laws_by_name():
     assert set(LAWS) == {"tanh"}
     with pytest.raises(ValueError, match="no law 'tan'; did you mean 'tanh'"):
         make_law("tan")
-    with pytest.raises(ValueError, match=r"law .tanh. doesn.t take the parameters.*gian"):
+    with pytest.raises(LawError, match=r"no parameter 'gian'; did you mean 'gain'\? \(known: gain\)") as caught:
         make_law(LawChoice("tanh", {"gian": 1.0}))
-    with pytest.raises(ValueError, match="gain of the tanh law must be positive; got -1"):
+    assert caught.value.parameter == "gian"
+    with pytest.raises(LawError, match="no parameter 'zzz'; known: gain"):
+        make_law(LawChoice("tanh", {"zzz": 1.0}))
+    for value in ("fast", True, (1.0, 2.0)):
+        with pytest.raises(LawError, match="gain of law 'tanh' must be a number; got"):
+            make_law(LawChoice("tanh", {"gain": value}))
+    for value in (np.inf, np.nan):
+        with pytest.raises(ValueError, match="positive and finite"):
+            TanhConsensus(value)
+    with pytest.raises(ValueError, match="gain of the tanh law must be positive and finite; got -1"):
         TanhConsensus(-1.0)
 
 

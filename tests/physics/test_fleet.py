@@ -32,6 +32,9 @@ class Swing(AgentModel):
     def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
         return np.stack([t * u[..., 0], u[..., 0]], -1)
 
+    def input_map_bound(self) -> FloatArray:
+        return np.array([np.inf, 1.0])
+
 
 class Wrong(Swing):
     type = "wrong"
@@ -154,3 +157,59 @@ def test_malformed_fleets_are_refused() -> None:
 def test_a_wrong_shape_names_the_model() -> None:
     with pytest.raises(ValueError, match=r"Wrong.drift\(t, x\) returned shape \(3, 2\), expected \(3, 2, 2\)"):
         Fleet([Wrong(), Wrong()]).drift(np.zeros(3), np.zeros((3, 4)))
+
+
+class Mapped(Swing):
+    """A single input to two states by whichever formula a test gives."""
+
+    type = "mapped"
+
+    def __init__(self, formula, limit=2.0, uses_state=False, bound=None) -> None:
+        self.formula, self.input_limit, self.input_map_uses_state, self.bound = formula, limit, uses_state, bound
+        super().__init__()
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+        return np.asarray(self.formula(t, x, u))
+
+    def input_map_bound(self) -> FloatArray:
+        return AgentModel.input_map_bound(self) if self.bound is None else np.asarray(self.bound)
+
+
+def both(t, x, u):
+    return np.concatenate([u, 3.0 * u], -1)
+
+
+def turned(t, x, u):
+    return np.stack([np.cos(x[..., 0]) * u[..., 0], np.sin(x[..., 0]) * u[..., 0]], -1)
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        (Mapped(turned), "depends on the state: set input_map_uses_state = True"),
+        (Mapped(turned, bound=[2.0, 2.0]), "depends on the state: set input_map_uses_state = True"),
+        (
+            Mapped(turned, uses_state=True),
+            r"depends on the state.*write input_map_bound\(self\), returning the largest",
+        ),
+        (Mapped(lambda t, x, u: both(t, x, u * u), np.inf), "isn't affine in each input.*write input_map_bound"),
+        (Mapped(lambda t, x, u: both(t, x, np.sin(u)), 3.1), "isn't affine in each input.*write input_map_bound"),
+        (Mapped(lambda t, x, u: both(t, x, t[..., None] * u)), "depends on time.*write input_map_bound"),
+        (Mapped(lambda t, x, u: u), r"Mapped.input_map\(t, x, u\) returned shape \(1, 2, 1\), expected \(1, 2, 2\)"),
+        (Mapped(lambda t, x, u: u[..., 0], bound=[1.0, 1.0]), r"input_map\(t, x, u\) returned shape \(1, 2\)"),
+        (Mapped(both, bound=[1.0]), "must return 2 numbers that aren't negative, one for each state"),
+        (Mapped(both, bound=[1.0, np.nan]), "must return 2 numbers that aren't negative"),
+    ],
+)
+def test_an_input_map_whose_bound_cannot_be_known_is_refused(model: Mapped, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Fleet([model])
+
+
+def test_bounds_of_input_maps() -> None:
+    assert Fleet([Mapped(both)]).input_map_bound.tolist() == [2.0, 6.0]
+    assert np.isinf(Fleet([Mapped(both, np.inf)]).input_map_bound).all()
+    free = Mapped(lambda t, x, u: np.concatenate([u, 0.0 * u + 1.0], -1), np.inf)
+    assert Fleet([free]).input_map_bound.tolist() == [np.inf, 1.0]
+    saturated = Mapped(turned, np.inf, uses_state=True, bound=[1.0, np.inf])  # one method is all it takes
+    assert Fleet([saturated]).input_map_bound.tolist() == [1.0, np.inf]

@@ -50,6 +50,23 @@ def test_k_that_leaves_nothing_is_refused() -> None:
         k_hop_neighbors(nx.path_graph(4), 0, relay=False)
 
 
+@pytest.mark.parametrize("k", [2.5, True, "3", None])
+def test_k_that_is_no_integer_is_refused(k: object) -> None:
+    path = nx.path_graph(4)
+    for call in (
+        lambda: hop_distances(path, k),
+        lambda: k_hop_neighbors(path, k),
+        lambda: check_task_graph(path, path, k),
+    ):
+        with pytest.raises(ValueError, match="k must be an integer, a number of hops; got"):
+            call()
+
+
+def test_a_huge_k_takes_no_longer_than_the_graph_is_wide() -> None:
+    assert k_hop_neighbors(nx.path_graph(4), 2 * 10**9) == ((2, 3), (3,), (0,), (0, 1))
+    assert k_hop_neighbors(nx.path_graph(4), np.int64(3)) == ((2, 3), (3,), (0,), (0, 1))
+
+
 def test_validated_graph_has_its_nodes_in_order_and_is_frozen() -> None:
     graph = nx.Graph([(3, 1), (np.int64(1), np.int64(0)), (0, 2)])
     tidy = validate_graph(graph, 4)

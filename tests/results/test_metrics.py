@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from agents import make_law
 from khop_env.observers import TargetObservers
 from khop_env.results import consensus_error, record, summarize
 from khop_env.scenarios import Scenario, paper
-from khop_env.simulation import Explicit
+from khop_env.simulation import Explicit, Extremes, Proximal
 
 KEYS = {
     "scenario", "controller", "observe", "seed", "dt", "integrator", "order", "duration", "wall_time_s",
@@ -61,3 +62,39 @@ def test_consensus_error_against_the_projection_matrix():
     projection = np.eye(16) - np.kron(np.ones((8, 8)), np.eye(2)) / 8.0
     assert consensus_error(fleet, x) == pytest.approx(np.linalg.norm(x @ projection, axis=1))
     assert consensus_error(fleet, np.tile([1.0, 2.0], 8)) == 0.0
+
+
+def test_numbers_that_are_not_finite_are_null():
+    """And nothing is said to be kept then, whatever the ratios are."""
+    recording, _ = summary(paper(), duration=0.1)
+    x = recording.x.copy()
+    x[-1, 0] = np.nan
+    nan = np.full(1, np.nan)
+    inside = np.full(1, 0.5)
+    for changes, null in (
+        ({"x": x}, "final_consensus_error"),
+        ({"extremes": Extremes(nan, inside, inside, inside)}, "max_normalized_disagreement"),
+        ({"extremes": Extremes(inside, inside, inside, nan)}, "max_error_to_bound_input"),
+    ):
+        found = summarize(
+            replace(recording, **changes),
+            paper(),
+            seed=2,
+            dt=0.01,
+            integrator=Proximal(),
+            controller="tanh",
+            observe="estimate",
+        )
+        assert found[null] is None
+        assert found["funnel_kept"] is False
+        assert found["diverged"] is ("x" in changes)
+        json.dumps(found, allow_nan=False)
+
+
+def test_states_that_ran_away_are_told():
+    recording, found = summary(paper(), duration=0.1)
+    assert found["diverged"] is False
+    for size, expected in ((1e5, False), (1e7, True), (1e300, True)):
+        far = replace(recording, x=recording.x * np.linspace(1.0, size, len(recording.x))[:, None])
+        again = summarize(far, paper(), seed=2, dt=0.01, integrator=Proximal(), controller="tanh", observe="estimate")
+        assert again["diverged"] is expected

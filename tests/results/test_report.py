@@ -1,12 +1,13 @@
 import json
 import math
+import re
 
 import networkx as nx
 import numpy as np
 import pytest
 
-from khop_env.observers import Exponential, TargetObservers
-from khop_env.physics import AgentModel, SingleIntegrator
+from khop_env.observers import DesignError, Exponential, TargetObservers
+from khop_env.physics import AgentModel, SingleIntegrator, Sinusoid, Term
 from khop_env.results import design_report
 from khop_env.scenarios import Scenario, paper
 from khop_env.scenarios.mixed_fleet import mixed_fleet
@@ -89,14 +90,73 @@ def test_a_design_that_is_impossible_is_reported_not_raised():
     json.dumps(report, allow_nan=False)
 
 
-def test_unbounded_inputs_are_infeasible_and_still_json():
-    report = design_report(path_of(models=(SingleIntegrator(input_limit=np.inf),) * 4))
-    assert report["feasible"] is False
+def test_unbounded_inputs_can_only_be_checked_at_the_start():
+    """As a simulator does (Assumption 2-ii): the report says null, not infeasible."""
+    scenario = path_of(models=(SingleIntegrator(input_limit=np.inf),) * 4)
+    report = design_report(scenario)
+    scenario.build()
+    assert report["feasible"] is True
+    assert report["error"] is None
     assert report["targets"][0]["input"][0]["start_share"] is None
     json.dumps(report, allow_nan=False)
+    wide = design_report(scenario.replace(radius=50.0))
+    assert wide["feasible"] is False
+    assert "take delta(0) above" in wide["error"]
+
+
+def test_the_keys_are_the_same_whatever_is_wrong():
+    whole, none = design_report(path_of()), design_report(path_of(theta=None))
+    assert whole.keys() == none.keys()
+    assert whole["explicit_step_bound_s"].keys() == none["explicit_step_bound_s"].keys()
+    assert none["pairs"] is none["estimates"] is none["explicit_step_bound_s"]["state"] is None
+
+
+class Own:
+    """max(floor, 10 exp(-t)), with what it says of its infimum."""
+
+    def __init__(self, floor: float, said: float) -> None:
+        self.floor, self.said = floor, said
+
+    def __call__(self, t):
+        return np.maximum(self.floor, 10.0 * np.exp(-t))
+
+    def infimum(self) -> float:
+        return self.said
+
+
+def test_a_bound_that_goes_below_its_own_infimum_is_refused():
+    report = design_report(path_of(delta=Own(0.1, 1.0)))
+    assert report["feasible"] is False
+    assert re.search(
+        r"delta: .*Own.* is 0\.99\d* at t = 2\.31 s, but its infimum\(\) says .* below 1;", report["error"]
+    )
+    assert "infimum() must be positive" in design_report(path_of(theta=Own(0.1, 0.0)))["error"]
+    assert design_report(path_of(delta=Own(0.1, 0.1)))["feasible"] is True
+    with pytest.raises(DesignError, match="Definition 1"):
+        path_of(delta=Own(np.nan, 0.1)).build()
+
+
+class Drizzle(Term):
+    """A disturbance of a user's own."""
+
+    def add(self, t, x, drawn, channels, out):
+        out[:, channels.index] += channels.amplitude
 
 
 class TestAssumptions:
+    def test_a_users_own_disturbance_is_not_known(self):
+        found = assumption(design_report(path_of(disturbance=Drizzle(0.2) + Sinusoid(0.1))), "1-iii")
+        assert found["status"] == "not known"
+        assert "|w| <= 0.3" in found["why"]
+        assert "Drizzle: your own" in found["why"]
+        assert "smooth" not in found["why"]
+        assert assumption(design_report(path_of(disturbance=Sinusoid(0.1))), "1-iii")["status"] == "holds"
+
+    def test_a_users_own_bound_need_not_decrease(self):
+        found = assumption(design_report(path_of(delta=Own(0.1, 0.1))), "6")
+        assert found["status"] == "not known"
+        assert "Own" in found["why"]
+
     def test_disturbance_bound_is_told(self):
         assert "|w| <= 0.3" in assumption(design_report(paper()), "1-iii")["why"]
         assert assumption(design_report(path_of()), "1-iii")["why"] == "w = 0"

@@ -6,8 +6,9 @@ import pytest
 
 from agents import make_law
 from khop_env.observers import Exponential
-from khop_env.physics import Sum, random_geometric_graph
+from khop_env.physics import DriftingIntegrator, Sum, random_geometric_graph
 from khop_env.scenarios import mixed_fleet, paper, random_geometric
+from khop_env.scenarios.files import write_scenario
 
 
 def spread(simulator):
@@ -107,6 +108,9 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
         ({"radius": np.ones(5)}, "radius must be one finite number or 16"),
         ({"radius": -1.0}, "radius must not be negative"),
         ({"dt": 0.0}, "dt must be positive"),
+        ({"dt": np.inf}, "dt must be positive and finite; got inf"),
+        ({"duration": np.nan}, "duration must be positive and finite; got nan"),
+        ({"k": 2.5}, "k must be an integer, a number of hops; got 2.5"),
         ({"communication": nx.path_graph(7)}, "missing 7"),
         ({"delta": {"vesel": Exponential(1, 1, 1)}}, "delta is given for 'vesel'"),
     ],
@@ -114,3 +118,23 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
 def test_a_scenario_that_does_not_fit_together_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         paper().replace(**changes).design  # noqa: B018
+
+
+def test_sizing_leaves_alone_what_an_unbounded_input_decides():
+    """|g| of the first four agents has no bound: theta keeps its start for them, and is sized for the others."""
+    free, limited = DriftingIntegrator(input_limit=np.inf), DriftingIntegrator(input_limit=10.0)
+    given = Exponential(2.0, 1.0, 5.0)
+    scenario = paper().replace(models=(free,) * 4 + (limited,) * 4, theta=given)
+    finite = paper().replace(models=(limited,) * 8, theta=given)
+    smallest = finite.design.inputs.smallest_initial_bound(finite.fleet.input_map_bound)
+    assert scenario.sized(2.0).theta == Exponential(2.0 * smallest[8:].max(), 1.0, 5.0)
+    assert scenario.replace(theta=Exponential(1e6, 1.0, 5.0)).sized().theta.initial == 1e6
+    assert scenario.replace(models=(free,) * 8).sized().theta == given
+    by_type = scenario.replace(models=(free,) * 8, theta={"drifter": [given, Exponential(3.0, 1.0, 5.0)]}).sized()
+    assert [one.initial for one in by_type.theta["drifter"]] == [2.0, 3.0]
+    scenario.replace(theta=Exponential(1e6, 1.0, 5.0)).sized().build()
+
+
+def test_the_papers_bounds_read_as_one_would_write_them():
+    assert "initial = 14.077\n" in write_scenario(paper())
+    assert "initial = 231.39\n" in write_scenario(paper())

@@ -4,13 +4,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import systems
+from strategies import System, systems
 
 from khop_env.physics import SurfaceVessel
 from khop_env.simulation import Proximal, Simulator
 
 STEPS = st.floats(np.log(1e-4), 0.0).map(lambda exponent: float(np.exp(exponent)))
 """Any step from 1e-4 s to 1 s, as likely in each decade."""
+
+
+def has_vessels(system: System) -> bool:
+    """Whether the fleet has agents whose drift grows with the square of a state."""
+    return any(isinstance(model, SurfaceVessel) for model in system.design.fleet.models)
 
 
 def assert_inside(simulator: Simulator) -> None:
@@ -30,14 +35,13 @@ def test_funnels_are_kept_for_any_step_and_any_jump_of_input_and_state(order, sy
 
     Random graphs, relay or not, fleets, funnels, observers with and without f and g_hat, and disturbances. Before each
     step every state and every input jumps to somewhere else, up to a thousand metres away; the step may change too.
-    Vessels jump by 10 (m, m/s) at most: their drift is quadratic, and an explicit step of 1 s from 1000 m/s ends at
-    1e12 m, where the rounding of a state is larger than a funnel.
+    Vessels jump by 1 (m, rad, m/s, rad/s) at most: their drift is quadratic, and what an explicit step of 1 s makes of
+    10 m/s sends the next predictor 1e8 m away, where the rounding of a position is felt in a funnel of a centimetre.
     """
     simulator = system.simulator(Proximal(order), batch)
     assert_inside(simulator)
     rng = np.random.default_rng(system.seed)
-    vessels = any(isinstance(model, SurfaceVessel) for model in system.design.fleet.models)
-    reach = 10.0 ** (min(decades, 1.0) if vessels else decades)
+    reach = 10.0 ** (min(decades, 0.0) if has_vessels(system) else decades)
     for _ in range(12):
         simulator._state.x[...] = reach * rng.uniform(-1.0, 1.0, simulator._state.x.shape)
         u = reach * rng.choice((-1.0, 0.0, 0.3, 1.0), (batch, system.design.fleet.m))
@@ -49,12 +53,16 @@ def test_funnels_are_kept_for_any_step_and_any_jump_of_input_and_state(order, sy
 @settings(max_examples=60)
 @given(system=systems(input_observer=True), dt=STEPS)
 def test_funnels_are_kept_from_the_start_under_inputs_at_their_limits(order, system, dt):
-    """The same for what a policy can do: inputs that flip between their limits every step, states that follow."""
+    """The same for what a policy can do: inputs that flip between their limits every step, states that follow.
+
+    An explicit step of a vessel's quadratic drag diverges above about 0.1 s; that is the plant's, not the observers'.
+    """
+    longest = 0.05 if has_vessels(system) else 1.0
     simulator = system.simulator(Proximal(order), 2)
     rng = np.random.default_rng(system.seed)
     limit = np.minimum(system.design.fleet.input_limit, 10.0)
     for _ in range(15):
-        simulator.step(min(dt, 0.2), limit * rng.choice((-1.0, 1.0), (2, len(limit))))
+        simulator.step(min(dt, longest), limit * rng.choice((-1.0, 1.0), (2, len(limit))))
         assert_inside(simulator)
 
 

@@ -220,7 +220,7 @@ def test_a_model_that_returns_no_number_is_an_error_though_nobody_observes_it(in
 
 @pytest.mark.parametrize("batch", [1, 5])
 def test_an_estimate_that_is_no_number_is_an_error(batch):
-    """A model's drift may fail at an estimate though not at the state. In a star without relay M is the identity, so one
+    """A drift may fail at an estimate though not at the state. In a star without relay M is the identity, so one
     observer's NaN doesn't spread to others that would show it.
     """
     fleet = Fleet([SingleIntegrator()] * 4)
