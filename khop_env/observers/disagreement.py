@@ -29,7 +29,7 @@ def transformation_slope(e: float) -> float:
 def barrier_curvature(e: float) -> float:
     """phi''(e) of the barrier phi = T^2 / 2; the correction's stiffness is phi''(e) / rho^2, at least 4 / rho^2."""
     slope = transformation_slope(e)
-    return slope * slope * (1.0 + e * log_ratio(e))
+    return slope * slope * (1.0 + e * transformation(e))
 
 
 @compiled

@@ -162,12 +162,10 @@ def record(
                 if progress is not None and (now := clock.perf_counter()) - shown > 0.1:
                     shown = now
                     progress(k / steps)
-        except FunnelError as left:  # the state is the last one inside the funnel: worth keeping
-            error = left
+        except (FunnelError, SolveError) as stopped:  # the state is the one before the step: worth keeping
+            error = stopped
             if done % stride:
                 samples.take()
-        except SolveError as failed:  # the state is that of a step half done: not worth keeping
-            error = failed
     wall_time = clock.perf_counter() - start
     if progress is not None and error is None:
         progress(1.0)

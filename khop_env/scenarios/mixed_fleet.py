@@ -25,11 +25,12 @@ SIDE = 4.0  # m: positions start in a square of twice this side
 def mixed_fleet() -> Scenario:
     """Three integrators, three carts, three unicycles and three vessels meet, over a ring in which no two alike touch.
 
-    Heterogeneous in n_i (2, 4, 3, 6) and m_i. Unicycles have no input observer, since their g depends on the heading;
-    their inputs are bounded, which is enough for the state observer (the paper's remark on omitting it). The vessels'
-    drift is only locally Lipschitz: limited forces and drag keep their velocities bounded. Disturbances are a sinusoid
-    on the integrators, band-limited noise on the carts' accelerations, gusts on the vessels, and a bounded coupling
-    that pulls unicycles away from the mean of all. All numbers are our choice.
+    Two chords join alike agents all the same. Heterogeneous in n_i (2, 4, 3, 6) and m_i. Unicycles have no input
+    observer, since their g depends on the heading; their inputs are bounded, which is enough for the state observer
+    (the paper's remark on omitting it). The vessels' drift is only locally Lipschitz: limited forces and drag keep
+    their velocities bounded. Disturbances are a sinusoid on the integrators, band-limited noise on the carts'
+    accelerations, gusts on the vessels, and a bounded coupling that pulls unicycles away from the mean of all. All
+    numbers are our choice.
     """
     models = (
         *[SingleIntegrator(input_limit=1.5)] * 3,
@@ -43,7 +44,8 @@ def mixed_fleet() -> Scenario:
     task.add_nodes_from(range(12))
     task.add_edges_from((ring[j], ring[(j + 3) % 12]) for j in range(12))  # three hops away, or fewer by a chord
     task.add_edges_from((ring[j], ring[j + 1]) for j in range(0, 12, 2))
-    radius = np.concatenate([[SIDE, SIDE], [SIDE, SIDE, 0.2, 0.2], [SIDE, SIDE, 1.5], [SIDE, SIDE, 1.5, 0.2, 0.2, 0.1]])
+    place = (SIDE, SIDE)
+    radii = (place, (*place, 0.2, 0.2), (*place, 1.5), (*place, 1.5, 0.2, 0.2, 0.1))  # of each kind's states
     return Scenario(
         name="mixed_fleet",
         description="12 integrators, carts, unicycles and vessels with all disturbances, k = 3",
@@ -68,7 +70,7 @@ def mixed_fleet() -> Scenario:
             + Gust((0.0, 0.0, 0.0, 0.2, 0.2, 0.1), duration=1.0, period=4.0, agents="vessel")
             + Coupling(0.1, gain=-0.5, agents="unicycle")
         ),
-        radius=np.concatenate([np.tile(part, 3) for part in (radius[:2], radius[2:6], radius[6:9], radius[9:])]),
+        radius=np.concatenate([np.tile(radius, 3) for radius in radii]),
         law=LawChoice("tanh", {"gain": GAIN}),
         duration=30.0,
     ).sized()

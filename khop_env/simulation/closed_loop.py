@@ -67,6 +67,11 @@ class ClosedLoop:
             )
         out.T[:] = u
 
+    def actuate(self, t: FloatArray, x: FloatArray, estimate: FloatArray, u: FloatArray, g: FloatArray) -> None:
+        """`command` the inputs `u` (m, B), and write their effect g(x, u) into `g` (n, B)."""
+        self.command(t, x, estimate, u)
+        self.fleet.input_map(t, x.T, u.T, g.T)
+
     def plant(self, t: FloatArray, x: FloatArray, g: FloatArray, drawn: FloatArray, out: FloatArray) -> None:
         """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
         states = x.T

@@ -77,8 +77,7 @@ class Explicit:
 
     def start(self, state: SimulatorState) -> None:
         """Make u and g agree with t, x and the estimates."""
-        self._loop.command(state.t, state.x, state.estimate, state.u)
-        self._loop.fleet.input_map(state.t, state.x.T, state.u.T, state.g.T)
+        self._loop.actuate(state.t, state.x, state.estimate, state.u, state.g)
 
     def step(self, state: SimulatorState, dt: float) -> None:
         """Advance by `dt` seconds, in place.
@@ -92,12 +91,14 @@ class Explicit:
         loop.omega.evaluate(state.t, self._omega)
         dy, dghat, e, q = self._derivative(state, self._rho, self._omega)
         for kind, funnels, normalized in (("state", loop.design.states, e), ("input", loop.design.inputs, q)):
-            if not np.all(np.abs(normalized) < 1.0):
-                who, ratio = _worst(loop, funnels, np.abs(normalized))
+            ratio = np.abs(normalized)
+            if not np.all(ratio < 1.0):
+                column, env = _largest(ratio)
                 raise FunnelError(
-                    f"the {kind} observer of {who} is outside its funnel before the step, at {ratio:.4g} times its "
-                    f"width: the {'state' if kind == 'state' else 'input (Assumption 2-ii)'} jumped. No explicit step "
-                    "can go on from there; the proximal integrator can"
+                    f"the {kind} observer of {_who(loop, funnels, column, env)} is outside its funnel before the step, "
+                    f"at {ratio[column, env]:.4g} times its width: the "
+                    f"{'state' if kind == 'state' else 'input (Assumption 2-ii)'} jumped. No explicit step can go on "
+                    "from there; the proximal integrator can"
                 )
         before = state.copy()
         try:
@@ -121,44 +122,40 @@ class Explicit:
             ("state", loop.design.states, loop.rho, self._rho, state.estimate, state.x, self._xi[0], e),
             ("input", loop.design.inputs, loop.omega, self._omega, state.input_estimate, state.g, self._xi[1], q),
         ):
-            funnel_before = funnel.copy()
             bank.evaluate(state.t, funnel)
             disagreement(*funnels.layout.arrays, estimate, source, xi)
             ratio = np.abs(xi) / funnel[funnels.layout.column_row]
             if not np.all(ratio < 1.0):
-                raise FunnelError(_left_funnel(loop, kind, funnels, ratio, e_before, funnel_before, dt, before.t))
+                raise FunnelError(_left_funnel(loop, kind, funnels, ratio, e_before, dt, before.t))
 
 
-def _worst(loop: ClosedLoop, funnels: Funnels, ratio: FloatArray) -> tuple[str, float]:
-    """Whose |e| is largest (a NaN counts as that), for a message, and how large."""
-    layout, fleet = funnels.layout, loop.fleet
+def _largest(ratio: FloatArray) -> tuple[int, int]:
+    """Column and environment of the largest |e|; a NaN counts as that."""
     column, env = np.unravel_index(int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio))), ratio.shape)
+    return int(column), int(env)
+
+
+def _who(loop: ClosedLoop, funnels: Funnels, column: int, env: int) -> str:
+    """Target, observer, component and environment of a column of estimates, for a message."""
+    layout, fleet = funnels.layout, loop.fleet
     agent, component, _ = fleet.component_names()[layout.column_source[column]]
     observer = fleet.ids[layout.observer[layout.column_pair[column]]]
-    return f"{agent!r} in {observer!r}, component {component!r}, environment {env},", float(ratio[column, env])
+    return f"{agent!r} in {observer!r}, component {component!r}, environment {env},"
 
 
 def _left_funnel(
-    loop: ClosedLoop,
-    kind: str,
-    funnels: Funnels,
-    ratio: FloatArray,
-    e: FloatArray,
-    funnel: FloatArray,
-    dt: float,
-    t: FloatArray,
+    loop: ClosedLoop, kind: str, funnels: Funnels, ratio: FloatArray, e: FloatArray, dt: float, t: FloatArray
 ) -> str:
-    """Which observer left its funnel, when, and the step that would have been stable just before."""
+    """Which observer left its funnel in a step from the times `t`, and the step that would have been stable."""
     layout = funnels.layout
-    column, env = np.unravel_index(int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio))), ratio.shape)
+    column, env = _largest(ratio)
     target = int(layout.row_target[layout.column_row[column]])
     curvature = np.zeros((len(layout.target), loop.batch))
-    largest_curvature(layout.plan, e, funnel, curvature)
+    largest_curvature(layout.plan, e, funnels.rho.evaluate(t, np.empty((layout.rows, loop.batch))), curvature)
     stable = 2.0 / (layout.eigenvalues[target, 1] * curvature[target, env])
-    who, largest = _worst(loop, funnels, ratio)
     return (
-        f"the explicit step left the funnel: {kind} observer of {who} reached |{'e' if kind == 'state' else 'q'}| = "
-        f"{largest:.4g} at t = {t[env] + dt:.6g} s with dt = {dt:g} s; just before, a step below "
-        f"{min(stable, dt):.2g} s would have been stable, and at steady state it has to be far below "
-        f"{funnels.explicit_step_bound().min():.2g} s: take a shorter one, or the proximal integrator"
+        f"the explicit step left the funnel: {kind} observer of {_who(loop, funnels, column, env)} reached "
+        f"|{'e' if kind == 'state' else 'q'}| = {ratio[column, env]:.4g} at t = {t[env] + dt:.6g} s with dt = {dt:g} s"
+        f"; just before, a step below {min(stable, dt):.2g} s would have been stable, and at steady state it has to be "
+        f"far below {funnels.explicit_step_bound().min():.2g} s: take a shorter one, or the proximal integrator"
     )

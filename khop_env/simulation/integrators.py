@@ -119,8 +119,7 @@ class Proximal:
 
     def start(self, state: SimulatorState) -> None:
         """Make u and g agree with t, x and the estimates."""
-        self._loop.command(state.t, state.x, state.estimate, state.u)
-        self._loop.fleet.input_map(state.t, state.x.T, state.u.T, state.g.T)
+        self._loop.actuate(state.t, state.x, state.estimate, state.u, state.g)
 
     def step(self, state: SimulatorState, dt: float) -> None:
         """Advance by `dt` seconds, in place. Where anything raises, the state is the one before the step.
