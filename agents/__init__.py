@@ -2,6 +2,5 @@
 
 from agents.consensus import TanhConsensus
 from agents.laws import LAWS, LawError, make_law
-from agents.velocity import VELOCITY_CONTROLLERS, velocity_to_input
 
-__all__ = ["LAWS", "VELOCITY_CONTROLLERS", "LawError", "TanhConsensus", "make_law", "velocity_to_input"]
+__all__ = ["LAWS", "LawError", "TanhConsensus", "make_law"]

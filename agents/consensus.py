@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agents.velocity import velocity_to_input
 from khop_env.compiled import compiled
 from khop_env.elementary import tanh
 from khop_env.observers import FloatArray, IntArray
+from khop_env.physics import velocity_to_input
 from khop_env.simulation import View
 
 
@@ -19,9 +19,9 @@ class TanhConsensus:
     """v_i = k_c sum over task edges of tanh(p_j - p_i), component by component, p_j as agent i hears or estimates it.
 
     The velocity command v_i goes to integrators as it stands (the paper's u_i) and to other models through
-    `agents.velocity`. Goal set A: all positions equal. Without drift and disturbance V = |e_c|^2 / 2 with e_c = Pi x
-    decreases along integrators, since tanh is odd and increasing (the paper's argument); estimation errors of bounded
-    size enter bounded. For the other models the set-ISS property is measured, not proven.
+    `physics.velocity_to_input`. Goal set A: all positions equal. Without drift and disturbance V = |e_c|^2 / 2 with
+    e_c = Pi x decreases along integrators, since tanh is odd and increasing (the paper's argument); estimation errors
+    of bounded size enter bounded. For the other models the set-ISS property is measured, not proven.
 
     Attributes:
         gain: k_c in 1/s, positive and finite.

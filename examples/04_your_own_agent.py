@@ -3,9 +3,9 @@
 import networkx as nx
 import numpy as np
 
-from agents import VELOCITY_CONTROLLERS, make_law
+from agents import make_law
 from khop_env.observers import Exponential
-from khop_env.physics import AgentModel, Sinusoid
+from khop_env.physics import VELOCITY_CONTROLLERS, AgentModel, Sinusoid
 from khop_env.scenarios import Scenario
 
 

@@ -1,25 +1,36 @@
-"""Scenarios by name."""
+"""Scenarios and environments by name."""
 
 from __future__ import annotations
 
+import importlib
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, get_type_hints
 
+from khop_env.env import BatchedEnv, JointEnv, KHopVectorEnv, Settings, Task
 from khop_env.physics import did_you_mean
+from khop_env.scenarios.convoy import convoy
 from khop_env.scenarios.mixed_fleet import mixed_fleet
 from khop_env.scenarios.paper import paper
 from khop_env.scenarios.random_geometric import random_geometric
 from khop_env.scenarios.scenario import Scenario
+from khop_env.simulation import Proximal
+
+if TYPE_CHECKING:
+    from khop_env.env.sb3 import KHopSB3VecEnv
 
 ScenarioFactory = Callable[..., Scenario]
 """A function that makes a scenario; the parameters of a family are int, float, bool or str, with defaults."""
 
 SCENARIOS: dict[str, ScenarioFactory] = {
-    factory.__name__: factory for factory in (paper, mixed_fleet, random_geometric)
+    factory.__name__: factory for factory in (paper, convoy, mixed_fleet, random_geometric)
 }
 """Every scenario of the library: the module `khop_env/scenarios/<name>.py` and its function of the same name."""
+
+ENVIRONMENTS = ("consensus_v0", "formation_v0", "leader_following_v0")
+"""Every environment of the library: the modules `khop_env/<name>.py`."""
 
 _TRUTH = {"true": True, "false": False}
 
@@ -27,6 +38,90 @@ _TRUTH = {"true": True, "false": False}
 def scenarios() -> tuple[str, ...]:
     """The names of all scenarios."""
     return tuple(SCENARIOS)
+
+
+def environments() -> tuple[str, ...]:
+    """The names of all environments."""
+    return ENVIRONMENTS
+
+
+def make_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopVectorEnv:
+    """A Gymnasium vector environment over the batched simulator.
+
+    Args:
+        environment: one of `environments()`.
+        num_envs: copies B; with N agents the vector environment has B * N rows.
+        arguments: those of the environment's `parallel_env`, without render_mode.
+
+    Raises:
+        ValueError: for an unknown environment or scenario, naming the nearest, or a wrong argument.
+    """
+    return KHopVectorEnv(_module(environment).batched_env(num_envs=num_envs, **arguments), name=environment)
+
+
+def make_sb3_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopSB3VecEnv:
+    """A Stable-Baselines3 VecEnv over the batched simulator, one sub-environment per agent and copy.
+
+    Args:
+        environment: one of `environments()`.
+        num_envs: copies B.
+        arguments: as for `make_vec`.
+
+    Raises:
+        ImportError: without Stable-Baselines3.
+        ValueError: as `make_vec`.
+    """
+    module = _module(environment)
+    try:
+        from khop_env.env.sb3 import KHopSB3VecEnv
+    except ImportError as error:
+        raise ImportError("make_sb3_vec needs Stable-Baselines3: pip install 'khop_env[rl]'") from error
+    return KHopSB3VecEnv(module.batched_env(num_envs=num_envs, **arguments))
+
+
+def make_joint(environment: str, render_mode: str | None = None, **arguments: Any) -> JointEnv:
+    """The centralised single-agent view, which `gymnasium.make("khop/Consensus-v0")` gives.
+
+    Args:
+        environment: one of `environments()`.
+        render_mode: None, "human" or "rgb_array".
+        arguments: those of the environment's `parallel_env`.
+
+    Raises:
+        ValueError: as `make_vec`.
+    """
+    return JointEnv(_module(environment).parallel_env(render_mode=render_mode, **arguments))
+
+
+def assemble(
+    scenario_or_name: Scenario | str | Path,
+    task: Callable[[Scenario], Task],
+    num_envs: int,
+    arguments: dict[str, Any],
+) -> BatchedEnv:
+    """The environment of a scenario and a task: what the `*_v0` modules call.
+
+    Args:
+        scenario_or_name: a scenario, or what `scenario` takes.
+        task: makes the task of the scenario's fleet and graphs.
+        num_envs: copies B.
+        arguments: of `Settings`, by name.
+
+    Raises:
+        TypeError: for an argument that there isn't, naming the nearest.
+        ValueError: for a wrong one.
+    """
+    settings = Settings.of(arguments)
+    chosen = scenario_or_name if isinstance(scenario_or_name, Scenario) else scenario(scenario_or_name)
+    order = chosen.order if settings.order is None else settings.order
+    simulator = chosen.build(integrator=Proximal(order, settings.threads), batch=num_envs)
+    return BatchedEnv(simulator, task(chosen), settings)
+
+
+def _module(environment: str) -> ModuleType:
+    if environment not in ENVIRONMENTS:
+        raise ValueError(f"no environment {environment!r}; {did_you_mean(environment, ENVIRONMENTS)}")
+    return importlib.import_module(f"khop_env.{environment}")
 
 
 def describe() -> list[dict[str, Any]]:

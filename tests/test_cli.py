@@ -53,7 +53,7 @@ class TestList:
 
     def test_json(self):
         found = only_json(khop("list", "--json"))["scenarios"]
-        assert [one["name"] for one in found] == ["paper", "mixed_fleet", "random_geometric"]
+        assert [one["name"] for one in found] == ["paper", "convoy", "mixed_fleet", "random_geometric"]
 
 
 class TestCheck:

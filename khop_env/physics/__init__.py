@@ -25,10 +25,12 @@ from khop_env.physics.models import (
     Unicycle,
     drifting_integrator_drift,
 )
+from khop_env.physics.velocity import VELOCITY_CONTROLLERS, velocity_to_input
 
 __all__ = [
     "DISTURBANCES",
     "MODELS",
+    "VELOCITY_CONTROLLERS",
     "AgentModel",
     "AttachedDisturbance",
     "BandLimitedNoise",
@@ -56,4 +58,5 @@ __all__ = [
     "paper_tree",
     "random_geometric_graph",
     "validate_graph",
+    "velocity_to_input",
 ]

@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.observers import FloatArray, Funnels, ObserverDesign
+from khop_env.observers import FloatArray, Funnels, IntArray, ObserverDesign
 from khop_env.observers.disagreement import disagreement, extremes
 from khop_env.simulation.closed_loop import ClosedLoop
 from khop_env.simulation.integrators import Integrator, Proximal
@@ -38,7 +38,7 @@ class InitialSet:
 
 @dataclass(frozen=True)
 class Extremes:
-    """The largest ratios since reset, one per environment: below 1 the guarantee holds.
+    """The largest ratios since reset or `restart_extremes`, one per environment: below 1 the guarantee holds.
 
     Attributes:
         normalized: (B,) largest |xi| / rho over pairs, components and steps.
@@ -157,39 +157,45 @@ class Simulator:
 
     # -- writing -------------------------------------------------------------------------------------------------
 
-    def reset(self, seed: int | Sequence[int | np.random.Generator] = 0, x0: ArrayLike | None = None) -> Simulator:
-        """Start a new episode in every environment.
+    def reset(
+        self,
+        seed: int | Sequence[int | np.random.Generator] = 0,
+        x0: ArrayLike | None = None,
+        environments: Sequence[int] | IntArray | None = None,
+    ) -> Simulator:
+        """Start a new episode, in every environment or in some; the others keep every bit.
 
         Args:
-            seed: environment b draws its initial state and disturbance from seed + b, or from seed[b].
-            x0: (n,) or (B, n) initial states instead of drawn ones.
+            seed: environment b draws its initial state and disturbance from seed + b; or one seed for each environment
+                that is reset, in their order.
+            x0: (n,) or (R, n) initial states instead of drawn ones, for the R environments that are reset.
+            environments: (R,) which; all B if left out.
 
         Raises:
-            ValueError: for x0 of a wrong shape or not finite, or not B seeds.
-            DesignError: for an x0 that the observers can't start from.
+            ValueError: for x0 of a wrong shape or not finite, not R seeds, or an environment that there isn't.
+            DesignError: for an x0 that the observers can't start from; nothing has been reset then.
         """
-        seeds = [seed + b for b in range(self.batch)] if isinstance(seed, int | np.integer) else list(seed)
-        if len(seeds) != self.batch:
-            raise ValueError(f"expected one seed or {self.batch}, one per environment; got {len(seeds)}")
-        given = self._initial_states(x0)
+        which = np.arange(self.batch) if environments is None else np.asarray(environments, dtype=np.int64)
+        if which.ndim != 1 or np.any((which < 0) | (which >= self.batch)):
+            raise ValueError(f"environments must be among 0 to {self.batch - 1}; got {environments!r}")
+        seeds = [seed + int(b) for b in which] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != len(which):
+            raise ValueError(f"expected one seed or {len(which)}, one per environment; got {len(seeds)}")
+        given = self._initial_states(x0, len(which))
         state, loop = self._state, self._loop
-        for b, one in enumerate(seeds):
+        for b, one in zip(which, seeds, strict=True):
             rng = np.random.default_rng(one)
             state.x[:, b] = self.initial.draw(rng)
             if loop.disturbance is not None:
                 state.drawn[b] = loop.disturbance.draw(rng)
         if given is not None:
-            state.x[...] = np.broadcast_to(given, (self.batch, self.fleet.n)).T
-        state.t[...] = 0.0
-        state.u[...] = 0.0
-        state.estimate[...] = self.initial.center[self.design.states.layout.column_source][:, None]
-        state.input_estimate[...] = 0.0
-        state.eps[...] = 0.0
-        state.nu[...] = 0.0
+            state.x[:, which] = np.broadcast_to(given, (len(which), self.fleet.n)).T
+        state.estimate[:, which] = self.initial.center[self.design.states.layout.column_source][:, None]
+        for zeros in (state.t, state.u, state.input_estimate, state.eps, state.nu, self._extremes):
+            zeros[..., which] = 0.0
         self.integrator.start(state)
-        self._extremes[...] = 0.0
         self._watch()
-        if not np.all(self._extremes[2] < 1.0):
+        if not np.all(self._extremes[2, which] < 1.0):
             away = np.where(np.isfinite(self.g), np.abs(self.g), 0.0).max(axis=0)
             self.design.require_feasible_start(np.zeros(self.fleet.n), away)
         return self
@@ -229,15 +235,18 @@ class Simulator:
         self._extremes[...] = 0.0
         self._watch()
 
-    def _initial_states(self, x0: ArrayLike | None) -> FloatArray | None:
+    def restart_extremes(self) -> None:
+        """Forget the ratios seen so far: `extremes` are those of the steps to come."""
+        self._extremes[...] = 0.0
+
+    def _initial_states(self, x0: ArrayLike | None, count: int) -> FloatArray | None:
         """Check given initial states, before anything is overwritten."""
         if x0 is None:
             return None
         given = np.asarray(x0, dtype=float)
-        if given.shape not in ((self.fleet.n,), (self.batch, self.fleet.n)) or not np.all(np.isfinite(given)):
+        if given.shape not in ((self.fleet.n,), (count, self.fleet.n)) or not np.all(np.isfinite(given)):
             raise ValueError(
-                f"x0 must be finite, of shape ({self.fleet.n},) or ({self.batch}, {self.fleet.n}); got shape "
-                f"{given.shape}"
+                f"x0 must be finite, of shape ({self.fleet.n},) or ({count}, {self.fleet.n}); got shape {given.shape}"
             )
         away = np.abs(given - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
         self.design.require_feasible_start(away, np.zeros(self.fleet.n))

@@ -4,8 +4,8 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from agents import LAWS, LawError, TanhConsensus, make_law, velocity_to_input
-from khop_env.physics import MODELS, AgentModel
+from agents import LAWS, LawError, TanhConsensus, make_law
+from khop_env.physics import MODELS, AgentModel, velocity_to_input
 from khop_env.scenarios import LawChoice, mixed_fleet, paper
 
 

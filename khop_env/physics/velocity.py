@@ -1,7 +1,7 @@
 """From a commanded velocity to each agent model's own inputs.
 
-Consensus laws say where an agent's position should go; what it takes to go there depends on the model. A model that
-the library doesn't know gets an entry of its own: `VELOCITY_CONTROLLERS["my_type"] = my_function`.
+Consensus laws and leaders' routes say where an agent's position should go; what it takes to go there depends on the
+model. A model that the library doesn't know gets an entry of its own: `VELOCITY_CONTROLLERS["my_type"] = my_function`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from khop_env.observers import FloatArray
-from khop_env.physics import AgentModel, DoubleIntegrator, SurfaceVessel
+from khop_env.physics.agent_model import AgentModel, FloatArray
+from khop_env.physics.models import DoubleIntegrator, SurfaceVessel
 
 VelocityController = Callable[..., FloatArray]
 

@@ -1,0 +1,33 @@
+"""THE API: the same numbers as PettingZoo, Gymnasium and Stable-Baselines3 want them."""
+
+from khop_env.env.actuators import ACTUATORS, Actuator, Direct, Hold, Lag, SlewLimit
+from khop_env.env.batched import INFO_KEYS, BatchedEnv, EnvState
+from khop_env.env.joint import JointEnv
+from khop_env.env.layout import Field, ObservationLayout, Slot
+from khop_env.env.parallel import KHopEnv
+from khop_env.env.settings import Settings
+from khop_env.env.tasks import Task, consensus, formation, leader_following
+from khop_env.env.vector import KHopVectorEnv
+
+__all__ = [
+    "ACTUATORS",
+    "INFO_KEYS",
+    "Actuator",
+    "BatchedEnv",
+    "Direct",
+    "EnvState",
+    "Field",
+    "Hold",
+    "JointEnv",
+    "KHopEnv",
+    "KHopVectorEnv",
+    "Lag",
+    "ObservationLayout",
+    "Settings",
+    "SlewLimit",
+    "Slot",
+    "Task",
+    "consensus",
+    "formation",
+    "leader_following",
+]

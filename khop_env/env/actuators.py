@@ -1,0 +1,112 @@
+"""Between an action and the input: what keeps the derivative of g bounded where a policy's actions jump.
+
+The input observer's theorem asks for inputs with a bounded derivative (Assumption 2-ii of the paper). A policy changes
+its action once in a control period, by any amount, so with `Direct` only the state observer's theorem holds; the others
+limit how fast the inputs change. Inputs are fractions of the input limits here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from khop_env.observers import FloatArray
+from khop_env.physics import did_you_mean
+
+
+class Actuator(Protocol):
+    """Turns commands into inputs, step by step."""
+
+    def __call__(self, command: FloatArray, u: FloatArray, dt: float, step: int, steps: int) -> FloatArray:
+        """Inputs in force during simulator step `step` of `steps` in this control period.
+
+        Args:
+            command: (B, m) commanded inputs, as fractions of the limits.
+            u: (B, m) the inputs before.
+            dt: length of the step in s.
+            step: its number within the control period, from 0.
+            steps: simulator steps in a control period.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Direct(Actuator):
+    """The input is the command, held over the control period."""
+
+    def __call__(self, command: FloatArray, u: FloatArray, dt: float, step: int, steps: int) -> FloatArray:
+        """The command."""
+        return command
+
+
+@dataclass(frozen=True)
+class Lag(Actuator):
+    """First-order lag, u' = (command - u) / time_constant, sampled exactly.
+
+    Attributes:
+        time_constant: in s, positive.
+    """
+
+    time_constant: float = 0.1
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "time_constant")
+
+    def __call__(self, command: FloatArray, u: FloatArray, dt: float, step: int, steps: int) -> FloatArray:
+        """Where the lag ends after the step."""
+        return u - math.expm1(-dt / self.time_constant) * (command - u)
+
+
+@dataclass(frozen=True)
+class SlewLimit(Actuator):
+    """The input follows the command at a limited rate.
+
+    Attributes:
+        rate: in 1/s, as a fraction of the input limit: at 10 it takes 0.1 s from zero to full.
+    """
+
+    rate: float = 10.0
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "rate")
+
+    def __call__(self, command: FloatArray, u: FloatArray, dt: float, step: int, steps: int) -> FloatArray:
+        """As near to the command as the rate allows."""
+        most = self.rate * dt
+        return u + np.minimum(np.maximum(command - u, -most), most)
+
+
+@dataclass(frozen=True)
+class Hold(Actuator):
+    """First-order hold: the input goes to the command in a straight line over the control period."""
+
+    def __call__(self, command: FloatArray, u: FloatArray, dt: float, step: int, steps: int) -> FloatArray:
+        """The next point of the line."""
+        return u + (command - u) / (steps - step)
+
+
+ACTUATORS: dict[str, type[Actuator]] = {"direct": Direct, "lag": Lag, "slew": SlewLimit, "hold": Hold}
+
+
+def as_actuator(actuator: str | Actuator) -> Actuator:
+    """An actuator by name with its default parameters, or the one given.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    if not isinstance(actuator, str):
+        return actuator
+    if actuator not in ACTUATORS:
+        raise ValueError(
+            f"no actuator {actuator!r}; {did_you_mean(actuator, ACTUATORS)} (or give one, e.g. Lag(time_constant=0.2))"
+        )
+    return ACTUATORS[actuator]()
+
+
+def _require_positive(actuator: Actuator, name: str) -> None:
+    value = getattr(actuator, name)
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"{type(actuator).__name__}.{name} must be positive and finite; got {value!r}")

@@ -1,0 +1,207 @@
+"""Which columns observations and the global state have: what a layout names is what a readout reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from khop_env.env.layout import Feature, Field, ObservationLayout, Slot, axis_names, features, slots_of
+from khop_env.env.readout import (
+    DELTA,
+    ESTIMATE,
+    ESTIMATE_COS,
+    ESTIMATE_RELATIVE,
+    ESTIMATE_SIN,
+    INPUT,
+    STATE,
+    STATE_COS,
+    STATE_RELATIVE,
+    STATE_SIN,
+    Column,
+    Readout,
+)
+from khop_env.env.tasks import Task
+from khop_env.observers import IntArray, ObserverDesign
+from khop_env.physics import Fleet
+from khop_env.simulation import Observe
+
+_STATE = {"value": STATE, "cos": STATE_COS, "sin": STATE_SIN}
+_ESTIMATE = {"value": ESTIMATE, "cos": ESTIMATE_COS, "sin": ESTIMATE_SIN}
+
+
+class ObservationColumns:
+    """The observations of a task's agents.
+
+    Args:
+        design: who hears and estimates whom.
+        task: task edges and leaders.
+        agents: the agents that observe, by index.
+        observe: what stands in the slots of agents out of earshot: their estimate, the truth, or nothing.
+        bounds: whether slots hold the guaranteed bound on the estimate's error.
+        uniform: the same columns for every agent, padded; or exactly what each agent has.
+        limit: bound on positions and other states, in their own units.
+        inputs: whether an agent sees its input in force: where an actuator makes it a state of its own.
+
+    Attributes:
+        layouts: one per agent.
+        readout: fills the observations of all agents, side by side.
+        offset: (N + 1,) where each agent's columns begin.
+    """
+
+    def __init__(
+        self,
+        design: ObserverDesign,
+        task: Task,
+        agents: Sequence[int],
+        *,
+        observe: Observe,
+        bounds: bool,
+        uniform: bool,
+        limit: float,
+        inputs: bool,
+    ) -> None:
+        self._design, self._fleet, self._observe = design, design.fleet, observe
+        self._bounds, self._uniform, self._limit, self._inputs = bounds, uniform, limit, inputs
+        models = self._fleet.models
+        self._types = list(dict.fromkeys(model.type for model in models))
+        self._axes = axis_names(self._fleet.position_dim)
+        self._most_rest = max(len(features(model)[1]) for model in models)
+        self._most_states, self._most_inputs = max(model.n for model in models), max(model.m for model in models)
+        self._delta_row = {int(source): row for row, source in enumerate(design.states.layout.row_source)}
+        start = design.states.delta.evaluate(np.zeros(1), np.empty((design.states.layout.rows, 1)))
+        self._largest_bound = max(limit, float(start.max(initial=0.0)))
+        self._reach = max(limit, float(np.abs(task.displacement).max(initial=0.0)))
+
+        slots = slots_of(design, task, agents)
+        columns = [
+            self._own(i) + [one for number, slot in enumerate(mine) for one in self._slot(i, number, slot)]
+            for i, mine in zip(agents, slots, strict=True)
+        ]
+        if uniform:
+            columns = self._padded(columns, [len(mine) for mine in slots])
+        self.layouts = [
+            ObservationLayout(self._fleet.ids[i], [one.field for one in mine], its_slots)
+            for i, mine, its_slots in zip(agents, columns, slots, strict=True)
+        ]
+        self.readout = Readout(
+            [one for mine in columns for one in mine],
+            [number for number, mine in enumerate(columns) for _ in mine],
+        )
+        self.offset: IntArray = np.concatenate([[0], np.cumsum([len(mine) for mine in columns])])
+
+    def _own(self, i: int) -> list[Column]:
+        model, first = self._fleet.models[i], int(self._fleet.input_offset[i])
+        columns = state_columns(self._fleet, i, "own", self._limit)
+        columns += self._padding("own", self._most_rest - len(features(model)[1]))
+        if self._inputs:
+            columns += [
+                Column(Field(f"own.input.{name}", "of its limit", -1.0, 1.0), INPUT, first + c)
+                for c, name in enumerate(model.inputs)
+            ]
+            columns += self._padding("own.input", self._most_inputs - model.m)
+        return columns + self._type("own", model.type)
+
+    def _slot(self, i: int, number: int, slot: Slot) -> list[Column]:
+        fleet, name, model = self._fleet, f"slot{number}", self._fleet.models[slot.agent]
+        columns = [
+            _flag(f"{name}.valid", True),
+            _flag(f"{name}.heard", slot.heard),
+            Column(Field(f"{name}.hops", "", 0.0, float(self._design.k)), value=float(slot.hops)),
+            _flag(f"{name}.task_edge", slot.task_edge),
+            *(self._type(name, model.type) if len(self._types) > 1 else ()),
+        ]
+        columns += [
+            Column(Field(f"{name}.displacement.{axis}", "m", -self._reach, self._reach), value=float(value))
+            for axis, value in zip(self._axes, slot.displacement, strict=True)
+        ]
+        estimated = not slot.heard and self._observe == "estimate"
+        origin = int(fleet.state_offset[slot.agent])
+        if estimated:
+            origin = self._design.states.layout.slot[i, slot.agent]
+        position, rest = features(model)
+        relative = ESTIMATE_RELATIVE if estimated else STATE_RELATIVE
+        columns += [
+            Column(
+                Field(f"{name}.position.{axis}", feature.unit, -2.0 * self._limit, 2.0 * self._limit),
+                relative,
+                origin + feature.component,
+                int(own),
+            )
+            for axis, feature, own in zip(self._axes, position, fleet.position_index[i], strict=True)
+        ]
+        columns += [
+            _state(name, one, (_ESTIMATE if estimated else _STATE)[one.how], origin, self._limit) for one in rest
+        ]
+        columns += self._padding(name, self._most_rest - len(rest))
+        if self._bounds:
+            columns += self._bound_columns(name, slot)
+        if self._observe == "local" and not slot.heard:
+            return [Column(one.field) for one in columns]
+        return columns
+
+    def _bound_columns(self, name: str, slot: Slot) -> list[Column]:
+        """Bounds in the order of the state: position, then the rest; heard agents have no error."""
+        model, first = self._fleet.models[slot.agent], int(self._fleet.state_offset[slot.agent])
+        states, position = list(model.states.items()), model.position_index.tolist()
+        columns = []
+        for component in [*position, *(c for c in range(model.n) if c not in position)]:
+            state, unit = states[component]
+            field = Field(f"{name}.bound.{state}", unit, 0.0, self._largest_bound)
+            columns.append(Column(field) if slot.heard else Column(field, DELTA, self._delta_row[first + component]))
+        return columns + self._padding(f"{name}.bound", self._most_states - model.n)
+
+    def _type(self, name: str, kind: str) -> list[Column]:
+        return [_flag(f"{name}.type.{one}", one == kind) for one in self._types] if self._uniform else []
+
+    def _padding(self, name: str, count: int) -> list[Column]:
+        return [_zero(f"{name}.padding{q}") for q in range(count if self._uniform else 0)]
+
+    def _padded(self, columns: list[list[Column]], slots: list[int]) -> list[list[Column]]:
+        """As many slots for every agent, and one Box."""
+        width, most = max(map(len, columns)), max(slots)
+        for mine, count in zip(columns, slots, strict=True):
+            slot_width = (width - len(mine)) // max(most - count, 1)
+            for number in range(count, most):
+                name = f"slot{number}"
+                mine += [_flag(f"{name}.valid", False), *self._padding(name, slot_width - 1)]
+        low = np.min([[one.field.low for one in mine] for mine in columns], axis=0)
+        high = np.max([[one.field.high for one in mine] for mine in columns], axis=0)
+        return [
+            [
+                Column(Field(one.field.name, one.field.unit, a, b), one.kind, one.a, one.b, one.value)
+                for one, a, b in zip(mine, low.tolist(), high.tolist(), strict=True)
+            ]
+            for mine in columns
+        ]
+
+
+def state_columns(fleet: Fleet, i: int, name: str, limit: float) -> list[Column]:
+    """Agent i's own state: its position, then the rest; angles as cosine and sine."""
+    position, rest = features(fleet.models[i])
+    origin = int(fleet.state_offset[i])
+    return [_state(name, one, _STATE[one.how], origin, limit) for one in [*position, *rest]]
+
+
+def global_state(fleet: Fleet, limit: float, inputs: bool) -> tuple[list[Field], Readout]:
+    """The true state of all agents, leaders included, one after the other; with their inputs where these are states."""
+    columns = [one for i, name in enumerate(fleet.ids) for one in state_columns(fleet, i, name, limit)]
+    if inputs:
+        columns += [
+            Column(Field(f"{agent}.input.{name}", "of its limit", -1.0, 1.0), INPUT, c)
+            for c, (agent, name, _) in enumerate(fleet.input_names())
+        ]
+    return [one.field for one in columns], Readout(columns, [0] * len(columns))
+
+
+def _state(name: str, feature: Feature, kind: int, origin: int, limit: float) -> Column:
+    limit = limit if feature.how == "value" else 1.0
+    return Column(Field(f"{name}.{feature.name}", feature.unit, -limit, limit), kind, origin + feature.component)
+
+
+def _flag(name: str, value: bool) -> Column:
+    return Column(Field(name, "", 0.0, 1.0), value=float(value))
+
+
+def _zero(name: str) -> Column:
+    return Column(Field(name, "", 0.0, 0.0))

@@ -1,0 +1,88 @@
+"""The centralised view: one Gymnasium agent that observes and moves the whole team."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike, NDArray
+
+from khop_env.env.batched import INFO_KEYS, Infos
+from khop_env.env.layout import Float32Array
+from khop_env.env.options import initial_states
+from khop_env.env.parallel import RENDER_MODES, KHopEnv
+
+
+class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
+    """All agents' observations side by side, all their actions side by side, and the mean of their rewards.
+
+    Infos hold the team's mean task error, the largest ratios, and the sums of the clip counts.
+
+    Args:
+        env: the ParallelEnv that is seen as one.
+
+    Attributes:
+        env: that environment; `env.layout(agent)` and `env.batched.observation_offset` say what an observation holds.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012
+
+    def __init__(self, env: KHopEnv) -> None:
+        self.env, self.render_mode = env, env.render_mode
+        self.metadata = dict(env.metadata)
+        layouts = env.batched.layouts
+        low, high = (np.concatenate([getattr(layout, end) for layout in layouts]) for end in ("low", "high"))
+        self.observation_space = Box(low, high, dtype=np.float32)
+        self.action_space = Box(-1.0, 1.0, (int(env.batched.action_offset[-1]),), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Float32Array, dict[str, Any]]:
+        """Start a new episode.
+
+        Args:
+            seed: as for the ParallelEnv.
+            options: likewise.
+        """
+        super().reset(seed=seed)
+        batched = self.env.batched
+        observations, infos = batched.reset(seed, initial_states=initial_states(batched.fleet, options))
+        return observations.reshape(-1), self._info(infos)
+
+    def step(self, action: ArrayLike) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
+        """Advance by one control period.
+
+        Args:
+            action: (A,) all agents' actions, in [-1, 1].
+
+        Raises:
+            ValueError: if no episode is running, or for an action of a wrong shape or not finite.
+        """
+        given = np.asarray(action)
+        if given.shape != self.action_space.shape:
+            raise ValueError(f"the action must have shape {self.action_space.shape}; got {given.shape}")
+        observations, reward, terminated, truncated, infos = self.env.batched.step(given[None])
+        info = self._info(infos)
+        return observations.reshape(-1), float(reward.mean()), bool(terminated[0]), bool(truncated[0]), info
+
+    def state(self) -> Float32Array:
+        """The true global state."""
+        return self.env.state()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A frame (H, W, 3), or the window."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.env.close()
+
+    def _info(self, infos: Infos) -> dict[str, Any]:
+        shown = self.env.shown(infos)
+        values = [np.array([one[key] for one in shown.values()]) for key in INFO_KEYS]
+        error, normalized, relative, observations, actions = values
+        team = error.mean(), normalized.max(), relative.max(), observations.sum(), actions.sum()
+        return dict(zip(INFO_KEYS, (one.item() for one in team), strict=True))

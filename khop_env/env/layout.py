@@ -1,0 +1,207 @@
+"""What stands where in an observation: the only place that knows; everybody else asks for fields by name.
+
+An agent's observation is its own state and one list of slots, a slot for each agent that it hears or estimates, ordered
+by relevance to its task: task edges first, then hop distance, then index.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from khop_env.env.tasks import Task
+from khop_env.observers import FloatArray, ObserverDesign
+from khop_env.physics import AgentModel, did_you_mean, hop_distances
+
+Float32Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Field:
+    """One column of an observation.
+
+    Attributes:
+        name: e.g. "own.x", "slot0.valid", "slot0.position.x" or "slot0.bound.x".
+        unit: e.g. "m"; "" where it has none.
+        low: smallest value.
+        high: largest value.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What is fixed of one other agent that an agent knows of.
+
+    Attributes:
+        agent: its index in the fleet.
+        id: its id.
+        heard: whether it is heard (1 hop), or estimated.
+        hops: distance in the communication graph.
+        task_edge: whether the observing agent has a task edge to it.
+        displacement: (d,) p_j - p_i that the task asks for, in m; zeros without a task edge.
+    """
+
+    agent: int
+    id: str
+    heard: bool
+    hops: int
+    task_edge: bool
+    displacement: FloatArray
+
+
+class ObservationLayout:
+    """Names, units and bounds of every column of one agent's observation.
+
+        layout = env.layout("drifter_0")
+        values = layout.read(observation)            # {"own.x1": 0.3, "slot0.valid": 1.0, ...}
+        layout.build(values)                         # the same vector again
+        layout.index("slot0.position.x")             # its column
+        layout.columns("slot0.position")             # its columns, where there are several
+
+    Args:
+        agent: the observing agent's id.
+        fields: one per column.
+        slots: what its slots are about, in their order; slots after these are padding, and all zero.
+    """
+
+    def __init__(self, agent: str, fields: Sequence[Field], slots: Sequence[Slot]) -> None:
+        self.agent, self.fields, self.slots = agent, tuple(fields), tuple(slots)
+
+    def __repr__(self) -> str:
+        return f"ObservationLayout({self.agent!r}, {len(self)} columns, {len(self.slots)} slots)"
+
+    def __len__(self) -> int:
+        """Number of columns."""
+        return len(self.fields)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The fields' names, in order."""
+        return tuple(field.name for field in self.fields)
+
+    @cached_property
+    def low(self) -> Float32Array:
+        """(D,) smallest values."""
+        return np.array([field.low for field in self.fields], np.float32)
+
+    @cached_property
+    def high(self) -> Float32Array:
+        """(D,) largest values."""
+        return np.array([field.high for field in self.fields], np.float32)
+
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        return {name: column for column, name in enumerate(self.names)}
+
+    def index(self, name: str) -> int:
+        """The column of a field.
+
+        Raises:
+            KeyError: naming the nearest field.
+        """
+        if name not in self._place:
+            raise KeyError(f"{self.agent!r} has no field {name!r}; {did_you_mean(name, self.names)}")
+        return self._place[name]
+
+    def columns(self, prefix: str) -> NDArray[np.int64]:
+        """The columns of a field, or of all fields below it: "slot0.position" has one per axis.
+
+        Raises:
+            KeyError: if there is none, naming the nearest field.
+        """
+        found = [q for q, name in enumerate(self.names) if name == prefix or name.startswith(prefix + ".")]
+        return np.array(found or [self.index(prefix)], np.int64)
+
+    def read(self, observation: ArrayLike) -> dict[str, NDArray[np.float32]]:
+        """Values by name from observations (..., D); each has shape (...).
+
+        Raises:
+            ValueError: if the last axis isn't D long.
+        """
+        given = np.asarray(observation)
+        if given.shape[-1:] != (len(self),):
+            raise ValueError(f"observations of {self.agent!r} have {len(self)} columns; got shape {given.shape}")
+        return {name: given[..., column] for column, name in enumerate(self.names)}
+
+    def build(self, values: Mapping[str, ArrayLike]) -> Float32Array:
+        """Observations (..., D) from values by name, which are broadcast against each other.
+
+        Raises:
+            KeyError: for missing or unknown names.
+        """
+        for name in values:
+            self.index(name)
+        missing = [name for name in self.names if name not in values]
+        if missing:
+            raise KeyError(f"observations of {self.agent!r} need {len(missing)} more fields, e.g. {missing[0]!r}")
+        return np.stack(np.broadcast_arrays(*(np.asarray(values[name], np.float32) for name in self.names)), axis=-1)
+
+
+@dataclass(frozen=True)
+class Feature:
+    """How a state component appears: as it stands, or an angle as its cosine and sine.
+
+    Attributes:
+        name: of the field.
+        unit: of the field.
+        component: index of the state component.
+        how: "value", "cos" or "sin".
+    """
+
+    name: str
+    unit: str
+    component: int
+    how: str = "value"
+
+
+def features(model: AgentModel) -> tuple[list[Feature], list[Feature]]:
+    """(position, rest) of a model's state: the position in the order of its axes, then the rest, angles as cos, sin."""
+    names, position = list(model.states.items()), model.position_index.tolist()
+    rest = []
+    for component, (name, unit) in enumerate(names):
+        if component in position:
+            continue
+        if unit == "rad":
+            rest += [Feature(f"{name}.{how}", "", component, how) for how in ("cos", "sin")]
+        else:
+            rest.append(Feature(name, unit, component))
+    return [Feature(names[component][0], names[component][1], component) for component in position], rest
+
+
+def axis_names(dim: int) -> list[str]:
+    """Names of the position's axes, common to all models."""
+    return list("xyz"[:dim]) if dim <= 3 else [f"axis{q}" for q in range(dim)]
+
+
+def slots_of(design: ObserverDesign, task: Task, agents: Sequence[int]) -> list[list[Slot]]:
+    """The slots of each of `agents`: everybody within k hops, in order of relevance.
+
+    Raises:
+        ValueError: for a task edge to an agent more than k hops away.
+    """
+    hops = hop_distances(design.communication, design.k)
+    wanted: list[dict[int, FloatArray]] = [{} for _ in range(len(design.fleet))]
+    for (i, j), displacement in zip(task.edges.tolist(), task.displacement, strict=True):
+        wanted[i][j] = displacement
+        if j not in hops[i]:
+            raise ValueError(
+                f"{design.fleet.ids[i]!r} has a task edge to {design.fleet.ids[j]!r}, which is more than "
+                f"k = {design.k} hops away, so that it knows nothing of it"
+            )
+    nowhere = np.zeros(design.fleet.position_dim)
+    return [
+        [
+            Slot(j, design.fleet.ids[j], hops[i][j] == 1, hops[i][j], j in wanted[i], wanted[i].get(j, nowhere))
+            for j in sorted((j for j in hops[i] if j != i), key=lambda j: (j not in wanted[i], hops[i][j], j))
+        ]
+        for i in agents
+    ]

@@ -1,0 +1,239 @@
+"""The PettingZoo environment: one copy, dictionaries by agent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from khop_env.env.batched import INFO_KEYS, BatchedEnv, EnvState, Infos
+from khop_env.env.layout import Float32Array, ObservationLayout
+from khop_env.env.options import initial_states
+from khop_env.observers import IntArray
+from khop_env.physics import did_you_mean
+
+if TYPE_CHECKING:
+    from khop_env.env.rendering import Renderer
+
+RENDER_MODES = ("human", "rgb_array")
+ParallelStep = tuple[
+    dict[str, Float32Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, float]]
+]
+
+
+class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
+    """Agents under partial communication, with estimates of those out of earshot: a PettingZoo ParallelEnv.
+
+    Observations, actions, rewards, infos and arguments are described in the modules `consensus_v0`, `formation_v0` and
+    `leader_following_v0`, which make such environments.
+
+    Args:
+        batched: a `BatchedEnv` of one copy.
+        name: of the environment.
+        render_mode: None, "human" or "rgb_array".
+
+    Attributes:
+        batched: the environment as arrays.
+
+    Raises:
+        ValueError: for an unknown render mode, or several copies.
+    """
+
+    def __init__(self, batched: BatchedEnv, *, name: str, render_mode: str | None = None) -> None:
+        if batched.batch != 1:
+            raise ValueError(f"a ParallelEnv is one copy; got {batched.batch}: use make_vec for several")
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(
+                f"render_mode must be None, 'human' or 'rgb_array'; got {render_mode!r}; "
+                f"{did_you_mean(str(render_mode), RENDER_MODES)}"
+            )
+        self.metadata = {
+            "name": name,
+            "render_modes": list(RENDER_MODES),
+            "render_fps": round(1.0 / batched.settings.control_period),
+            "is_parallelizable": True,
+        }
+        self.batched, self.render_mode = batched, render_mode
+        self.possible_agents = list(batched.agents)
+        self.agents: list[str] = []
+        self._layouts = dict(zip(batched.agents, batched.layouts, strict=True))
+        self.observation_spaces = {
+            agent: Box(layout.low, layout.high, dtype=np.float32) for agent, layout in self._layouts.items()
+        }
+        self._columns = _slices(batched.agents, batched.observation_offset)
+        self._entries = _slices(batched.agents, batched.action_offset)
+        self.action_spaces = {
+            agent: Box(-1.0, 1.0, (part.stop - part.start,), np.float32) for agent, part in self._entries.items()
+        }
+        self.state_space = state_space(batched)
+        self._actions = np.zeros((1, int(batched.action_offset[-1])), np.float32)
+        self._task_error: float | None = None  # mean over agents, for the picture; None before the first reset
+        self._renderer: Renderer | None = None
+
+    def __repr__(self) -> str:
+        return f"KHopEnv({self.metadata['name']}, {len(self.possible_agents)} agents)"
+
+    def __str__(self) -> str:
+        return str(self.metadata["name"])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_renderer": None}
+
+    def observation_space(self, agent: str) -> Box:
+        """The same object at every call."""
+        return self.observation_spaces[self._known(agent)]
+
+    def action_space(self, agent: str) -> Box:
+        """[-1, 1] per input; the same object at every call."""
+        return self.action_spaces[self._known(agent)]
+
+    def layout(self, agent: str) -> ObservationLayout:
+        """Names, units and bounds of every column of this agent's observation."""
+        return self._layouts[self._known(agent)]
+
+    def reset(
+        self, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Float32Array], dict[str, dict[str, float]]]:
+        """Start a new episode.
+
+        Args:
+            seed: draws initial states, disturbances and leaders' routes. Without one, an environment that was seeded
+                goes on with its generator, and one that never was draws fresh entropy.
+            options: {"initial_state": {agent: states}} or the whole fleet's (n,); others are ignored with a warning.
+
+        Raises:
+            ValueError: for an unknown agent or states of a wrong length.
+            DesignError: for initial states that the observers can't start from.
+        """
+        observations, infos = self.batched.reset(seed, initial_states=initial_states(self.batched.fleet, options))
+        self.agents = list(self.possible_agents)
+        return self._by_agent(observations), self.shown(infos)
+
+    def step(self, actions: Mapping[str, Float32Array]) -> ParallelStep:
+        """Advance by one control period.
+
+        Args:
+            actions: one per agent, entries in [-1, 1].
+
+        Raises:
+            ValueError: if no episode is running, or an action is missing, of an unknown agent, misshapen or not finite;
+                nothing has changed then.
+        """
+        observations, reward, terminated, truncated, infos = self.batched.step(self._flat(actions))
+        over = bool(terminated[0]), bool(truncated[0])
+        agents = self.possible_agents
+        if any(over):
+            self.agents = []
+        return (
+            self._by_agent(observations),
+            dict(zip(agents, reward[0].tolist(), strict=True)),
+            dict.fromkeys(agents, over[0]),
+            dict.fromkeys(agents, over[1]),
+            self.shown(infos),
+        )
+
+    def observe(self, agent: str) -> Float32Array:
+        """What an agent observes now."""
+        return self.batched.observations().reshape(-1)[self._columns[self._known(agent)]]
+
+    def state(self) -> Float32Array:
+        """The true global state, leaders included; `batched.state_fields` names its entries."""
+        return self.batched.state()[0]
+
+    def get_state(self) -> EnvState:
+        """Everything that the next steps depend on, generators included."""
+        return self.batched.get_state()
+
+    def set_state(self, state: EnvState) -> None:
+        """Continue from `get_state()`'s result, bit for bit."""
+        self.batched.set_state(state)
+        self.agents = [] if state.over[0] else list(self.possible_agents)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A frame (H, W, 3) in mode "rgb_array"; shows it in mode "human".
+
+        Raises:
+            ValueError: without a render mode, or before the first reset.
+        """
+        if self.render_mode is None:
+            raise ValueError(
+                "render() needs a render mode: make the environment with render_mode='rgb_array' or 'human'"
+            )
+        return self._draw()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _known(self, agent: str) -> str:
+        if agent not in self._layouts:
+            leaders = [self.batched.fleet.ids[i] for i in self.batched.task.leaders]
+            why = "it is a leader, which takes no part" if agent in leaders else did_you_mean(agent, self._layouts)
+            raise ValueError(f"no agent {agent!r}; {why}")
+        return agent
+
+    def _flat(self, actions: Mapping[str, Float32Array]) -> Float32Array:
+        if not self.agents:
+            raise ValueError("no episode is running: it is over, or none has begun; call reset() first")
+        flat = self._actions[0]
+        for agent, part in self._entries.items():
+            if agent not in actions:
+                missing = [one for one in self.agents if one not in actions]
+                raise ValueError(f"actions are missing for {len(missing)} agents: {', '.join(missing[:8])}")
+            try:
+                given = np.asarray(actions[agent], dtype=np.float32)
+            except (TypeError, ValueError):
+                raise ValueError(f"the action of {agent!r} isn't numbers: {actions[agent]!r}") from None
+            if given.shape != (part.stop - part.start,):
+                raise ValueError(
+                    f"the action of {agent!r} must have shape ({part.stop - part.start},); got {given.shape}"
+                )
+            flat[part] = given
+        if len(actions) != len(self._entries):
+            for agent in actions:
+                self._known(agent)
+        return self._actions
+
+    def _by_agent(self, observations: Float32Array) -> dict[str, Float32Array]:
+        flat = observations.reshape(-1)
+        return {agent: flat[part] for agent, part in self._columns.items()}
+
+    def shown(self, infos: Infos) -> dict[str, dict[str, float]]:
+        """Infos by agent, after the window has been brought up to date in mode "human"."""
+        self._task_error = float(infos["task_error"].mean())
+        if self.render_mode == "human":
+            self._draw()
+        rows = zip(*(infos[key][0].tolist() for key in INFO_KEYS), strict=True)
+        return {agent: dict(zip(INFO_KEYS, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
+
+    def _draw(self) -> NDArray[np.uint8] | None:
+        if self._task_error is None:
+            raise ValueError("there is nothing to render yet: call reset() first")
+        simulator, task = self.batched.simulator, self.batched.task
+        if self._renderer is None:
+            from khop_env.env.rendering import Renderer
+
+            self._renderer = Renderer(simulator.design, task.edges, leaders=task.leaders, title=str(self))
+        seen = simulator.extremes
+        normalized = max(float(seen.normalized[0]), float(seen.input_normalized[0]))
+        scene = float(simulator.t[0]), simulator.x[0], simulator.estimates[0], normalized, self._task_error
+        if self.render_mode == "rgb_array":
+            return self._renderer.frame(*scene)
+        self._renderer.show(*scene)
+        return None
+
+
+def _slices(agents: tuple[str, ...], offset: IntArray) -> dict[str, slice]:
+    return {agent: slice(int(a), int(b)) for agent, a, b in zip(agents, offset[:-1], offset[1:], strict=True)}
+
+
+def state_space(batched: BatchedEnv) -> Box:
+    """The space of `BatchedEnv.state`'s rows."""
+    low, high = (np.array([getattr(one, end) for one in batched.state_fields], np.float32) for end in ("low", "high"))
+    return Box(low, high, dtype=np.float32)

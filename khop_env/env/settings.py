@@ -1,0 +1,116 @@
+"""The arguments that all environments share, checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
+from khop_env.physics import did_you_mean
+from khop_env.simulation import OBSERVE, Observe
+
+Reward = Literal["agent", "team"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What can be chosen of an environment beside its scenario and its task.
+
+    Attributes:
+        observe: what the slots of agents out of earshot hold: their "estimate", the truth ("oracle"), or nothing
+            ("local").
+        bounds: whether they hold the guaranteed bound delta(t) on the estimate's error, too.
+        uniform: one padded Box for all agents; or exactly what each agent has.
+        max_cycles: control periods after which an episode is truncated.
+        control_period: time between actions in s.
+        dt: the simulator's step in s; the control period by default.
+        order: of the simulator's step, 1 or 2; the scenario's by default.
+        actuator: "direct", "lag", "slew", "hold", or an `Actuator`.
+        reward: "agent" for each agent's own, "team" for the mean of all.
+        effort: weight of the squared input (fractions of its limits), in m^2.
+        success_radius: terminate when no agent's task error exceeds it, in m; None to go on to the horizon.
+        limit: bound on positions and other states in observations, in their own units; values beyond are clipped.
+        threads: of the observers' solve.
+
+    Raises:
+        ValueError: naming the argument, what was given and what is expected.
+    """
+
+    observe: Observe = "estimate"
+    bounds: bool = False
+    uniform: bool = True
+    max_cycles: int = 200
+    control_period: float = 0.05
+    dt: float | None = None
+    order: int | None = None
+    actuator: str | Actuator = "direct"
+    reward: Reward = "agent"
+    effort: float = 0.1
+    success_radius: float | None = None
+    limit: float = 100.0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if self.observe not in OBSERVE:
+            raise ValueError(
+                f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}; "
+                f"{did_you_mean(str(self.observe), OBSERVE)}"
+            )
+        if self.reward not in ("agent", "team"):
+            raise ValueError(f"reward must be 'agent' or 'team'; got {self.reward!r}")
+        for name in ("bounds", "uniform"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False; got {getattr(self, name)!r}")
+        if isinstance(self.max_cycles, bool) or not isinstance(self.max_cycles, int) or self.max_cycles < 1:
+            raise ValueError(f"max_cycles must be a positive integer; got {self.max_cycles!r}")
+        for name in ("control_period", "dt", "success_radius", "limit"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise ValueError(f"{name} must be positive and finite; got {value!r}")
+        if not 0.0 <= self.effort < math.inf:
+            raise ValueError(f"effort must be finite and not negative; got {self.effort!r}")
+        object.__setattr__(self, "actuator", as_actuator(self.actuator))
+        if isinstance(self.actuator, Hold) and self.substeps == 1:
+            raise ValueError(
+                "actuator='hold' draws a line over several simulator steps, and here a control period is one: "
+                f"give dt below control_period = {self.control_period:g} s"
+            )
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> Settings:
+        """Settings from keyword arguments.
+
+        Raises:
+            TypeError: for a name that there isn't, naming the nearest.
+        """
+        known = [one.name for one in dataclasses.fields(cls)]
+        for name in arguments:
+            if name not in known:
+                raise TypeError(f"no argument {name!r}; {did_you_mean(name, known)}")
+        return cls(**arguments)
+
+    @property
+    def substeps(self) -> int:
+        """Simulator steps in a control period.
+
+        Raises:
+            ValueError: if the period isn't a whole number of steps.
+        """
+        if self.dt is None:
+            return 1
+        steps = round(self.control_period / self.dt)
+        if steps < 1 or abs(steps * self.dt - self.control_period) > 1e-9 * self.control_period:
+            near = self.control_period / max(1, steps)
+            raise ValueError(
+                f"control_period = {self.control_period:g} s isn't a whole number of simulator steps dt = {self.dt:g} "
+                f"s; dt = {near:.6g} would make it {max(1, steps)}"
+            )
+        return steps
+
+    @property
+    def inputs_are_states(self) -> bool:
+        """Whether the actuator remembers its input, which agents have to see then."""
+        return not isinstance(self.actuator, Direct)

@@ -1,0 +1,160 @@
+"""
+# Formation
+
+| Creation             | `make("aec", "khop/Formation-v0")`                 |
+|----------------------|----------------------------------------------------|
+| Actions              | Continuous                                         |
+| Parallel API         | Yes                                                |
+| Manual Control       | No                                                 |
+| Agents               | `agents= ['drifter_0', ..., 'drifter_7']`          |
+| Agents               | 8                                                  |
+| Action Shape         | (2,); the most inputs that an agent has            |
+| Action Values        | [-1, 1]                                            |
+| Observation Shape    | (59,)                                              |
+| Observation Values   | [-200, 200]; `limit` chooses them                  |
+| State Shape          | (16,)                                              |
+| State Values         | [-100, 100]                                        |
+
+Agents of a team are to stand in a formation, anywhere: to keep the displacement d_ij along every edge (i, j) of a task
+graph. Most of these edges join agents that can't hear each other: an agent hears its neighbours in the communication
+graph, and estimates the states of agents 2 to k hops away, with errors inside bounds that were chosen in advance.
+
+### Observation Space
+
+An agent observes its own state and a list of slots, one for every other agent within k hops: agents it hears (1 hop)
+and agents whose state it estimates (2 to k hops), ordered by relevance to its task: task edges first, then hop
+distance, then index. With uniform observations the list is padded to the longest; an invalid slot is all zeros.
+`env.layout(agent)` names every column with its unit, and reads and builds observations.
+
+| Columns                     | What                                                                              |
+|-----------------------------|-----------------------------------------------------------------------------------|
+| own.<state>                 | own position, then the other states; an angle as own.<state>.cos and .sin         |
+| own.input.<input>           | own input in force, as a fraction of its limit; not with actuator="direct"        |
+| own.type.<type>             | one-hot of the agent's type; uniform only                                         |
+| slot0.valid                 | 1 if the slot is in use                                                           |
+| slot0.heard                 | 1 if the agent is heard, 0 if it is estimated                                     |
+| slot0.hops                  | hop distance in the communication graph                                           |
+| slot0.task_edge             | 1 if this agent's task has an edge to it                                          |
+| slot0.type.<type>           | one-hot of its type; uniform observations of fleets with several types only       |
+| slot0.displacement.x, .y    | where the task wants it, relative to this agent, in m                             |
+| slot0.position.x, .y        | where it is heard or estimated to be, relative to this agent, in m                |
+| slot0.<state>               | its other states; an angle as cosine and sine                                     |
+| slot0.bound.<state>         | the guaranteed bound on the estimate's error, 0 if heard; with `bounds=True` only |
+| slot1.valid ...             | the next slot                                                                     |
+
+`observe="oracle"` puts the truth and `observe="local"` zeros into the slots of agents that aren't heard; nothing else
+changes, and the spaces stay the same.
+
+### Action Space
+
+Each agent's inputs as fractions of their limits, in [-1, 1]; what is beyond is clipped and counted in the infos. With
+uniform observations all agents have as many entries as the largest, and ignore those that they have no input for.
+
+### Reward
+
+Every control period an agent gets
+
+    -control_period * (mean over its task edges of |p_j - p_i - d_ij|^2 + effort * |u_i|^2)
+
+with true positions p in m at the end of the period, the displacements d_ij of the formation,
+and its input u_i as fractions of the limits. With `reward="team"` all agents get the mean.
+
+Episodes are truncated after `max_cycles` control periods, and terminate only if `success_radius` asks for it.
+Infos are numbers under constant keys: `task_error`, the root mean square error along the agent's own task edges in m;
+`max_normalized_disagreement` and `max_error_to_bound`, the largest |xi| / rho and |error| / bound of any observer since
+the last action, below 1 by guarantee; `clipped_observations` and `clipped_actions`.
+
+Initial states and disturbances are drawn per episode from the seed; `reset(options={"initial_state": {"drifter_0":
+[0.5, -0.5]}})` gives some or all of them. `get_state()` and `set_state()` save and restore everything, and a pickled or
+deep-copied environment continues bit for bit.
+
+### Arguments
+
+```python
+from khop_env import formation_v0
+
+formation_v0.parallel_env(scenario="paper", observe="estimate", bounds=False, uniform=True, max_cycles=200,
+control_period=0.05, dt=None, order=None, actuator="direct", reward="agent", effort=0.1, success_radius=None,
+limit=100.0, threads=1, render_mode=None,
+points=None, spacing=1.0)
+```
+
+`points`: (N, d) where the agents stand in the formation, in m; d_ij = points[j] - points[i]. By default a ring of
+up to 12 agents, or a square grid
+
+`spacing`: distance of neighbours in the default formation in m (default 1)
+
+`scenario`: a name (`khop list`), one with parameters ("random_geometric:agents=12"), a path that ends in .toml, or a
+`Scenario`
+
+`observe`: what slots of agents out of earshot hold: "estimate" (default), "oracle" for the truth, "local" for nothing
+
+`bounds`: whether slots hold the guaranteed bound on the estimate's error, too (default False)
+
+`uniform`: one padded Box for all agents (default), or with False exactly what each agent has
+
+`max_cycles`: control periods in an episode, which is truncated then (default 200)
+
+`control_period`: time between actions in s (default 0.05)
+
+`dt`: the simulator's step in s; the control period has to be a multiple of it, and is one step by default
+
+`order`: order of the simulator's step, 1 or 2; by default the scenario's
+
+`actuator`: "direct" (default), "lag", "slew", "hold", or one of `khop_env.env` with parameters, e.g.
+`Lag(time_constant=0.2)`; all but the first keep the derivative of the inputs bounded, as the input observer's theorem
+asks (Assumption 2-ii of the paper)
+
+`reward`: "agent" (default) for each agent's own, "team" for the mean of all
+
+`effort`: weight of the squared input in the reward, in m^2 (default 0.1)
+
+`success_radius`: terminate the episode when no agent's task error exceeds it, in m (default None: never)
+
+`limit`: bound on positions and other states in observations, in their units (default 100); what is beyond is clipped
+and counted in the infos
+
+`threads`: of the observers' solve (default 1)
+
+`render_mode`: None (default), "human" or "rgb_array"
+
+### Version History
+
+* v0: Initial version (khop_env 0.1.0, 2026-11)
+
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pettingzoo import AECEnv
+from pettingzoo.utils import parallel_to_aec
+
+from khop_env.env import BatchedEnv, KHopEnv, formation
+from khop_env.registry import assemble
+from khop_env.scenarios import Scenario
+
+__all__ = ["batched_env", "env", "parallel_env", "raw_env"]
+
+
+def batched_env(scenario: Scenario | str | Path = "paper", *, num_envs: int = 1, **arguments: Any) -> BatchedEnv:
+    """`num_envs` copies as arrays (copies, agents, ...); arguments as listed at the top of this module."""
+    own = {name: arguments.pop(name) for name in ("points", "spacing") if name in arguments}
+    return assemble(scenario, lambda chosen: formation(chosen.fleet, chosen.task, **own), num_envs, arguments)
+
+
+def parallel_env(
+    scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Any
+) -> KHopEnv:
+    """The PettingZoo ParallelEnv; arguments as listed at the top of this module."""
+    return KHopEnv(batched_env(scenario, **arguments), name="formation_v0", render_mode=render_mode)
+
+
+def env(scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Any) -> AECEnv:
+    """The AEC environment, by PettingZoo's own conversion; arguments as listed at the top of this module."""
+    return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **arguments))
+
+
+raw_env = env
