@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from khop_env.compiled import compiled, inlined, place
-from khop_env.elementary import expm1
+from khop_env.elementary import expm1, log
 
 if TYPE_CHECKING:
     from khop_env.observers.layout import FloatArray, IntArray
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
 MAX_ITERATIONS = 200
 LANES = 64  # scalar problems solved side by side: enough to fill vector registers, few enough to stay in cache
+_JUMP = 1.0  # in e, which lies between -1 and 1
 _LONG_STEP = 0.5  # in eps: beyond it exp is not nearly linear
 
 
@@ -52,20 +53,21 @@ def _barrier(eps: float) -> tuple[float, float, float]:
     return math.copysign(e, eps), eps * (slope * inverse), q * q * inverse
 
 
-@compiled
-def eps_of_impulse(z: float) -> float:
-    """Invert z = eps (1 + cosh eps), by Newton in logarithms (increasing and nearly straight, so a few steps do)."""
-    target = abs(z)
-    if target < 1e-8:
-        return 0.5 * z
-    a = min(0.5 * target, 1.0 + math.log1p(target))
-    goal = math.log(target)
-    for _ in range(50):
-        value = math.log(a) + a + 2.0 * math.log1p(math.exp(-a)) - 0.6931471805599453 - goal
-        step = value / (1.0 / a + math.tanh(0.5 * a))
-        a = max(a - step, 0.25 * a)
-        if abs(step) <= 1e-14 * a:
-            break
+@inlined
+def eps_near_impulse(z: float) -> float:
+    """Invert z = eps (1 + cosh eps) to a relative 2e-5, for |z| up to 1e300.
+
+    For large |z| it is Lambert's W of 2 |z|, started as R. Iacono and J. P. Boyd do (2017), for small ones z / 2; then
+    two steps of Newton's method in logarithms, where the function is increasing and nearly straight.
+    """
+    target = min(abs(z), 1e300) + 1e-300
+    growth = log(1.0 + 2.0 * target)
+    lambert = growth * (1.0 - log(1.0 + growth) / (2.0 + growth))
+    a = 0.5 * target if target < 0.5 else min(0.5 * target, lambert)
+    e, value, _ = _barrier(a)
+    a -= 2.0 * a * (value - target) / ((value + target) * (1.0 + a * e))
+    e, value, _ = _barrier(a)  # written twice: a loop here would keep the caller's from vectorising
+    a -= 2.0 * a * (value - target) / ((value + target) * (1.0 + a * e))
     return math.copysign(a, z)
 
 
@@ -139,6 +141,68 @@ def _newton_step(
             factor = row_start[a] + j
             for lane in range(lanes):
                 dz[j, lane] -= lower[factor, lane] * dz[a, lane]
+
+
+@compiled
+def _land(
+    size: tuple[int, int],
+    active: FloatArray,
+    u: FloatArray,
+    z: FloatArray,
+    gain: FloatArray,
+    dz: FloatArray,
+    answer: FloatArray,
+) -> None:
+    """After long steps, take eps from the impulse that Newton's method has arrived at: it isn't linear in it."""
+    for a in range(size[0]):
+        for lane in range(size[1]):
+            far = active[lane] * abs(dz[a, lane] * gain[a, lane]) > _LONG_STEP
+            # e(z) flattens away from 0: an impulse that would cross it stops there first
+            landing = eps_near_impulse(answer[a, lane]) if z[a, lane] * answer[a, lane] >= 0.0 else 0.0
+            u[a, lane] = landing if far else u[a, lane]
+
+
+@compiled
+def _start_anew(
+    members: tuple[int, int, int],
+    relay: FloatArray,
+    scale: FloatArray,
+    work: FloatArray,
+    lack: FloatArray,
+    common: FloatArray,
+) -> bool:
+    """Replace a warm start that a jump of the source has made useless; say whether there was one.
+
+    Since M 1 = h, the equations of all observers add up to sum e + s sum h z = sum b. Where the warm start misses that
+    by much, every observer starts from the one impulse that would meet it.
+    """
+    eta, pair, lanes = members
+    b, e, z, u = work[0], work[1], work[2], work[7]
+    links = 0.0
+    for lane in range(lanes):
+        lack[lane] = 0.0
+        common[lane] = 0.0
+    for a in range(eta):
+        h = relay[pair + a]
+        links += h
+        for lane in range(lanes):
+            common[lane] += b[a, lane]
+            lack[lane] += e[a, lane] + scale[lane] * h * z[a, lane]
+    furthest = 0.0
+    for lane in range(lanes):
+        furthest = max(furthest, abs(common[lane] - lack[lane]))
+    if not furthest > _JUMP:
+        return False
+    for lane in range(lanes):
+        far = abs(common[lane] - lack[lane]) > _JUMP
+        walls = 0.8 * eta  # sum e, about, where all are near the wall
+        impulse = max(abs(common[lane]) - walls, 0.0) / (scale[lane] * links)
+        common[lane] = math.copysign(eps_near_impulse(impulse), common[lane])
+        lack[lane] = 1.0 if far else 0.0
+    for a in range(eta):
+        for lane in range(lanes):
+            u[a, lane] = common[lane] if lack[lane] > 0.0 else u[a, lane]
+    return True
 
 
 @compiled
@@ -243,6 +307,8 @@ def solve(
             moving = True
             while moving:
                 _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
+                if iteration == 0 and _start_anew((eta, pair, lanes), relay, scale, work, worst, poison):
+                    _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 _newton_step((eta, pair, lanes), diagonal, link_start, link, first, scale, work, lower, row_start)
                 evaluations += eta * lanes
                 iteration += 1
@@ -266,12 +332,7 @@ def solve(
                     moving = moving or on
                     longest = max(longest, worst[lane])
                 if longest > _LONG_STEP:
-                    for a in range(eta):
-                        for lane in range(lanes):
-                            if active[lane] > 0.0 and abs(dz[a, lane] * gain[a, lane]) > _LONG_STEP:
-                                # e(z) flattens away from 0: an impulse that would cross it stops there first
-                                crosses = z[a, lane] * answer[a, lane] < 0.0
-                                u[a, lane] = 0.0 if crosses else eps_of_impulse(answer[a, lane])
+                    _land((eta, lanes), active, u, z, gain, dz, answer)
                 if moving and iteration == MAX_ITERATIONS:
                     for lane in range(lanes):
                         if active[lane] > 0.0:
