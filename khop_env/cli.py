@@ -23,6 +23,7 @@ from khop_env import __version__
 from khop_env.terminal import Progress, print_table, say, waiting
 
 if TYPE_CHECKING:
+    from khop_env.results import Recording
     from khop_env.scenarios import LawChoice, Scenario
 
 EXPLICIT_STEP = 1e-5  # s: how the paper samples its example
@@ -151,6 +152,11 @@ def run(
     order: Annotated[OrderOption | None, typer.Option(help="Of the proximal integrator; the scenario's.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the initial state and the disturbance.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for the files; by default runs/SCENARIO.")] = None,
+    video: Annotated[Path | None, typer.Option(help="Film the run, too: a file ending in .mp4 or .gif.")] = None,
+    observer: Annotated[
+        str | None,
+        typer.Option(help="Agent whose beliefs the film shows, by id or number; by default the one that needs most."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate the closed loop; write its tables, its summary and the paper's figure.
@@ -175,6 +181,7 @@ def run(
                 raise ValueError(f"{option} must be positive and finite; got {value!r}")
         simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
         simulator.reset(seed)
+        shown = _film(video, observer, scenario)
         folder = out or Path("runs") / _folder_name(scenario.name)
         folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost
     with Progress(f"simulating {scenario.name}") as progress:
@@ -194,16 +201,20 @@ def run(
             files = write_run(recording, scenario, summary, folder)
         except RunFileError as error:
             files, unwritten = error.written, error
+    unfilmed = None if video is None else _write_video(recording, scenario, video, shown, files)
     if as_json:
         _print_json({**summary, "files": {key: str(path) for key, path in files.items()}})
     else:
         from khop_env.terminal import print_summary
 
         print_summary(summary, files)
+        if "video" in files:
+            typer.echo(f"video: {files['video']}")
     if recording.error is not None:
         say(f"khop: {recording.error}")
-    if unwritten is not None:
-        say(f"khop: {unwritten}")
+    if failures := [failure for failure in (unwritten, unfilmed) if failure is not None]:
+        for failure in failures:
+            say(f"khop: {failure}")
         raise typer.Exit(2)
     if not summary["funnel_kept"]:
         raise typer.Exit(1)
@@ -244,7 +255,7 @@ def _mistakes(name: str | None = None) -> Iterator[None]:
     """Tell of a mistake in what was asked in one paragraph, without a traceback; `name` is the scenario's."""
     try:
         yield
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         from khop_env.observers import DesignError
 
         in_file = name is not None and isinstance(error, DesignError)
@@ -289,6 +300,40 @@ def _law(scenario: Scenario, controller: str | None) -> LawChoice:
     from khop_env.scenarios import LawChoice
 
     return scenario.law if controller in (None, scenario.law.name) else LawChoice(str(controller))
+
+
+def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int | None:
+    """Refuse a film that couldn't be made before there is something to lose; the number of the agent to show, if any.
+
+    Raises:
+        ValueError: for a file or an agent that won't do.
+        ModuleNotFoundError: if a package is missing.
+        OSError: if its folder can't be made.
+    """
+    if video is None:
+        if observer is not None:
+            raise ValueError("--observer chooses whose beliefs a film shows; give --video FILE, too")
+        return None
+    from khop_env.results.video import require_video
+
+    require_video(video)
+    shown = None if observer is None else scenario.fleet.agent(int(observer) if observer.isdecimal() else observer)
+    video.parent.mkdir(parents=True, exist_ok=True)
+    return shown
+
+
+def _write_video(
+    recording: Recording, scenario: Scenario, path: Path, observer: int | None, files: dict[str, Path]
+) -> str | None:
+    """Write the film and add it to `files`; or what went wrong, which must not cost the run its other results."""
+    from khop_env.results.video import write_video
+
+    try:
+        with Progress(f"filming {scenario.name}") as progress:
+            files["video"] = write_video(recording, scenario, path, observer=observer, progress=progress)
+    except Exception as error:
+        return f"couldn't write {path} ({str(error) or type(error).__name__})"
+    return None
 
 
 def _print_json(value: Any) -> None:

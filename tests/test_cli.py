@@ -202,6 +202,32 @@ class TestRun:
         assert found["funnel_kept"] is False
         assert found["diverged"] is True
 
+    @pytest.mark.parametrize("film", ["film.mp4", "new/film.gif"])
+    def test_a_film_is_one_more_file(self, folder, film):
+        options = ["--duration", "0.1", "--out", "out", "--video", film]
+        result = khop("run", "paper", *options, "--observer", "drifter_5")
+        assert f"video: {film}\n" in result.stdout
+        assert (folder / film).stat().st_size > 5000
+        assert len(list((folder / "out").iterdir())) == 4
+        assert only_json(khop("run", "paper", *options, "--observer", "5", "--json"))["files"]["video"] == film
+
+    def test_a_film_that_cannot_be_written_loses_nothing_else(self, folder):
+        (folder / "film.gif").mkdir()
+        result = khop("run", "paper", "--duration", "0.1", "--out", "out", "--video", "film.gif", status=2)
+        assert "summary: out/summary.json" in result.stdout
+        assert "video:" not in result.stdout
+        assert "khop: couldn't write film.gif (" in result.stderr
+        assert len(list((folder / "out").iterdir())) == 4
+
+    def test_films_that_could_not_be_made_are_refused_before_anything_is_computed(self, folder, monkeypatch):
+        assert "ends in .mp4 or .gif" in refused("run", "paper", "--video", "film.avi")
+        assert "did you mean 'drifter_" in refused("run", "paper", "--video", "film.gif", "--observer", "driftr_1")
+        assert "no agent 8" in refused("run", "paper", "--video", "film.gif", "--observer", "8")
+        assert "give --video FILE, too" in refused("run", "paper", "--observer", "1")
+        monkeypatch.setitem(sys.modules, "pygame", None)
+        assert "pip install 'khop_env[render]'" in refused("run", "paper", "--video", "film.gif")
+        assert not list(folder.iterdir())
+
     def test_a_file_that_cannot_be_written_is_told_after_the_summary(self, folder):
         (folder / "out" / "figure.png").mkdir(parents=True)
         result = khop("run", "paper", "--duration", "0.05", "--out", "out", status=2)

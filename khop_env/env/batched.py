@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.kernels import judge, read_actions
 from khop_env.env.layout import Float32Array, ObservationLayout
-from khop_env.env.leaders import LeaderRoutes
+from khop_env.env.leaders import LeaderRoutes, require_same_leaders
 from khop_env.env.settings import Settings
 from khop_env.env.tasks import Task
 from khop_env.observers import FloatArray, IntArray
@@ -136,7 +136,7 @@ class BatchedEnv:
             ValueError: for not R seeds, or initial states of a wrong shape or infinite; nothing has been reset then.
             DesignError: for initial states that the observers can't start from; likewise.
         """
-        which = np.arange(self.batch) if copies is None else np.asarray(copies, np.int64)
+        which = self.simulator.chosen(copies)
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + int(b) for b in which]
         else:
@@ -216,8 +216,9 @@ class BatchedEnv:
         """Continue from `get_state()`'s result, which stays as it is.
 
         Raises:
-            ValueError: if it is of an environment of other dimensions; nothing has changed then.
+            ValueError: if it is of an environment of other dimensions or leaders; nothing has changed then.
         """
+        require_same_leaders(self._routes, state.routes)
         self.simulator.restore(state.simulator)
         self._inputs[...] = state.inputs
         self._cycles, self._over, self._seeded = state.cycles.copy(), state.over.copy(), state.seeded.copy()
@@ -282,11 +283,11 @@ class BatchedEnv:
         """Write actions into the commands, or refuse them and change nothing."""
         given = np.asarray(actions)
         width = int(self.action_offset[-1])
-        if given.shape[:1] != (self.batch,) or given.size != self.batch * width or given.dtype.kind not in "fiu":
-            shape = (self.batch, width)
-            if self.settings.uniform:
-                shape = (self.batch, len(self.agents), width // len(self.agents))  # type: ignore[assignment]
-            raise ValueError(f"actions must be numbers of shape {shape}; got {given.dtype} of shape {given.shape}")
+        shapes: list[tuple[int, ...]] = [(self.batch, width)]
+        if self.settings.uniform:
+            shapes.insert(0, (self.batch, len(self.agents), width // len(self.agents)))
+        if given.shape not in shapes or given.dtype.kind not in "fiu":
+            raise ValueError(f"actions must be numbers of shape {shapes[0]}; got {given.dtype} of shape {given.shape}")
         flat = np.ascontiguousarray(given.reshape(self.batch, width), np.float32)
         clipped = np.zeros_like(self._clipped_actions)
         bad = read_actions(flat, self._action_entry, self._action_column, self._action_owner, self._command, clipped)

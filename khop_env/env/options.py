@@ -34,8 +34,13 @@ def initial_states(fleet: Fleet, options: Mapping[str, Any] | None) -> FloatArra
                 stacklevel=3,
             )
     given = options.get("initial_state")
+    if given is None:
+        return None
     if not isinstance(given, Mapping):
-        return None if given is None else np.asarray(given, dtype=float)
+        whole = np.asarray(given, dtype=float)
+        if not np.isfinite(whole).all():
+            raise ValueError("option initial_state: states must be finite; {agent: states} gives some of them")
+        return whole
     x0 = np.full(fleet.n, np.nan)
     for agent, states in given.items():
         try:

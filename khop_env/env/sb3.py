@@ -50,10 +50,16 @@ class KHopSB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Float32Array, Float32Array, NDArray[np.bool_], list[dict[str, Any]]]:
-        """Advance all rows by one control period."""
+        """Advance all rows by one control period.
+
+        Raises:
+            ValueError: for actions of a wrong shape or not finite; nothing has changed then.
+        """
         batched, agents = self.batched, len(self.batched.agents)
-        actions = np.asarray(self._actions).reshape(batched.batch, agents, -1)
-        observations, reward, terminated, truncated, infos = batched.step(actions)
+        given, shape = np.asarray(self._actions), (self.num_envs, int(batched.action_offset[1]))
+        if given.shape != shape:
+            raise ValueError(f"actions must have shape {shape}; got {given.shape}")
+        observations, reward, terminated, truncated, infos = batched.step(given.reshape(batched.batch, agents, -1))
         over = terminated | truncated
         described: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if over.any():

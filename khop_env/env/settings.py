@@ -73,7 +73,8 @@ class Settings:
         if not 0.0 <= self.effort < math.inf:
             raise ValueError(f"effort must be finite and not negative; got {self.effort!r}")
         object.__setattr__(self, "actuator", as_actuator(self.actuator))
-        if isinstance(self.actuator, Hold) and self.substeps == 1:
+        substeps = self.substeps  # refuses a period that isn't a whole number of steps
+        if isinstance(self.actuator, Hold) and substeps == 1:
             raise ValueError(
                 "actuator='hold' draws a line over several simulator steps, and here a control period is one: "
                 f"give dt below control_period = {self.control_period:g} s"

@@ -172,19 +172,17 @@ class Simulator:
             environments: (R,) which; all B if left out.
 
         Raises:
-            ValueError: for x0 of a wrong shape or not finite, not R seeds, or an environment that there isn't.
+            ValueError: for x0 of a wrong shape or not finite, not R seeds, or `environments` that aren't different ones.
             DesignError: for an x0 that the observers can't start from; nothing has been reset then.
         """
-        which = np.arange(self.batch) if environments is None else np.asarray(environments, dtype=np.int64)
-        if which.ndim != 1 or np.any((which < 0) | (which >= self.batch)):
-            raise ValueError(f"environments must be among 0 to {self.batch - 1}; got {environments!r}")
+        which = self.chosen(environments)
         seeds = [seed + int(b) for b in which] if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != len(which):
             raise ValueError(f"expected one seed or {len(which)}, one per environment; got {len(seeds)}")
+        generators = [np.random.default_rng(one) for one in seeds]  # a seed that is none is refused here
         given = self._initial_states(x0, len(which))
         state, loop = self._state, self._loop
-        for b, one in zip(which, seeds, strict=True):
-            rng = np.random.default_rng(one)
+        for b, rng in zip(which, generators, strict=True):
             state.x[:, b] = self.initial.draw(rng)
             if loop.disturbance is not None:
                 state.drawn[b] = loop.disturbance.draw(rng)
@@ -238,6 +236,22 @@ class Simulator:
     def restart_extremes(self) -> None:
         """Forget the ratios seen so far: `extremes` are those of the steps to come."""
         self._extremes[...] = 0.0
+
+    def chosen(self, environments: Sequence[int] | IntArray | None) -> IntArray:
+        """The environments meant, by number; all if None.
+
+        Raises:
+            ValueError: for one that there isn't, one named twice, or anything else than whole numbers.
+        """
+        if environments is None:
+            return np.arange(self.batch)
+        which = np.asarray(environments)
+        if which.dtype == bool:
+            raise ValueError("environments must be numbers, not a mask: give np.flatnonzero(mask)")
+        wrong = which.ndim != 1 or (which.size and which.dtype.kind not in "iu")
+        if wrong or np.any((which < 0) | (which >= self.batch)) or len(np.unique(which)) < len(which):
+            raise ValueError(f"environments must be different ones among 0 to {self.batch - 1}; got {environments!r}")
+        return which.astype(np.int64)
 
     def _initial_states(self, x0: ArrayLike | None, count: int) -> FloatArray | None:
         """Check given initial states, before anything is overwritten."""

@@ -1,0 +1,310 @@
+"""Frames of a running fleet: who is where, who hears whom, and what one agent believes of those it can't hear."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.env.rendering.camera import Camera, Labels
+from khop_env.env.rendering.canvas import Canvas, Window, load_pygame
+from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
+from khop_env.env.rendering.scene import (
+    EDGE_COLOR,
+    PALE,
+    SOFT,
+    TRAIL,
+    Beliefs,
+    angles,
+    headings,
+    looks,
+    mix,
+    neediest,
+    sensible,
+    short_names,
+    undirected,
+)
+from khop_env.observers import FloatArray, IntArray, ObserverDesign
+
+_MOST_LABELS = 40  # in larger fleets only the agents whose estimates are shown are labelled
+_FADES = 8  # shades of a trail
+
+
+class Renderer:
+    """Draws the state of a fleet as pictures, or in a window.
+
+    Agents by type, communication edges solid and task edges dashed; for one agent its beliefs: ghosts where it
+    estimates its targets, each in the box that the observers guarantee to hold the target. Fleets in space are seen
+    from above, fleets on a line have a row for each agent.
+
+    Args:
+        design: the observers, which know the fleet and the communication graph.
+        task_edges: (E, 2) directed pairs (i, j): agent i acts on j.
+        leaders: indices of the agents marked as leaders.
+        observer: index of the agent whose beliefs are shown; by default the one with most task edges to agents that it
+            can't hear.
+        title: shown above the picture.
+        size: width and height in pixels.
+
+    Attributes:
+        observer: index of the agent whose beliefs are shown.
+
+    Raises:
+        ModuleNotFoundError: without pygame-ce.
+        ValueError: for an observer or leader that isn't an agent.
+    """
+
+    def __init__(
+        self,
+        design: ObserverDesign,
+        task_edges: IntArray,
+        *,
+        leaders: Sequence[int] = (),
+        observer: int | None = None,
+        title: str = "",
+        size: tuple[int, int] = (900, 720),
+    ) -> None:
+        load_pygame()
+        fleet, agents = design.fleet, len(design.fleet)
+        self._fleet, self._title, self._size = fleet, title, size
+        self._leaders = frozenset(fleet.agent(leader) for leader in leaders)
+        self.observer = neediest(design, task_edges) if observer is None else fleet.agent(observer)
+        self._beliefs = Beliefs(design, self.observer)
+        self._edges = undirected(np.array(design.communication.edges, int).reshape(-1, 2))
+        self._tasks, self._heard = undirected(task_edges), frozenset(self._edges)
+        self._headings = headings(fleet)
+        self._looks = looks(fleet.models)
+        self._look = [self._looks[model.type] for model in fleet.models]
+        self._names = short_names(fleet)
+        self._crowded = agents > _MOST_LABELS
+        self._labelled = [self.observer, *self._beliefs.targets] if self._crowded else list(range(agents))
+
+        self._unit = max(0.75, min(size[0] / 900, size[1] / 720))
+        self._radius = self._unit * float(np.clip(9.0 * math.sqrt(20 / agents), 4.5, 9.0))
+        self._thin = self._unit * (0.5 if self._crowded else 1.0)
+        panel = 212 * self._unit
+        left, top, bottom = 58 * self._unit, 40 * self._unit, 50 * self._unit
+        self._map = (left, top, size[0] - left - panel, size[1] - top - bottom)
+        self._rows = top + self._map[3] * (np.arange(agents) + 0.5) / agents
+        self._panel = Panel(
+            (size[0] - panel + 20 * self._unit, top, panel - 36 * self._unit, self._map[3]),
+            self._unit,
+            {f"{kind}  {self._span(kind)}": look for kind, look in self._looks.items()},
+            leaders=bool(self._leaders),
+            task=bool(self._tasks),
+            observer=(fleet.ids[self.observer], self._look[self.observer]) if self._beliefs.targets else None,
+        )
+        self._canvas: Canvas | None = None
+        self._window: Window | None = None
+        self._dismissed = False
+        self._restart()
+
+    def frame(
+        self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None = None
+    ) -> NDArray[np.uint8]:
+        """One picture. A time before the last one's begins a new episode.
+
+        Args:
+            t: in s.
+            x: (n,) state of the fleet.
+            estimates: (P,) in the order of `design.states.layout`.
+            normalized: largest |e| = |xi| / rho of now.
+            task_error: in m, if there is one to show.
+
+        Returns:
+            (H, W, 3) pixels, a fresh array.
+        """
+        return self._draw(t, x, estimates, normalized, task_error).array()
+
+    def show(
+        self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None = None
+    ) -> None:
+        """Show the picture that `frame` would return in a window, and wait so that there are at most 25 a second.
+
+        Once the window was closed by hand nothing is shown any more. Without a display SDL draws to none.
+
+        Args:
+            t: in s.
+            x: (n,) state of the fleet.
+            estimates: (P,) in the order of `design.states.layout`.
+            normalized: largest |e| = |xi| / rho of now.
+            task_error: in m, if there is one to show.
+        """
+        if self._dismissed:
+            return
+        if self._window is None:
+            self._window = Window(self._size, self._title)
+        if self._window.show(self._draw(t, x, estimates, normalized, task_error)):
+            self.close()
+            self._dismissed = True
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+        self._window, self._dismissed = None, False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the window, surfaces and fonts, which can't be copied."""
+        return {**self.__dict__, "_canvas": None, "_window": None}
+
+    def _restart(self) -> None:
+        self._trail: deque[tuple[float, FloatArray]] = deque()
+        self._labels = Labels()
+        self._camera = Camera(self._map, margin=38 * self._unit)
+
+    def _span(self, kind: str) -> str:
+        names = [name for name, model in zip(self._names, self._fleet.models, strict=True) if model.type == kind]
+        return names[0] if len(names) == 1 else f"{names[0]}–{names[-1]}"
+
+    def _draw(
+        self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None
+    ) -> Canvas:
+        canvas = self._canvas = self._canvas or Canvas(self._size)
+        positions = sensible(x[self._fleet.position_index[:, :2]])
+        ghosts = self._beliefs.positions(estimates)
+        elapsed = self._remember(t, positions)
+        self._follow(positions, ghosts, elapsed)
+        everyone, targets = np.arange(len(positions)), np.array(self._beliefs.targets, int)
+        middles, haunts = self._pixels(positions, everyone), self._pixels(ghosts, targets)
+
+        canvas.clear()
+        self._draw_grid(canvas)
+        canvas.clip(self._map)
+        self._draw_trails(canvas, t)
+        hidden = self._draw_boxes(canvas, t, ghosts)
+        self._draw_edges(canvas, middles)
+        self._draw_agents(canvas, x, middles)
+        self._draw_ghosts(canvas, estimates, middles, haunts)
+        self._draw_labels(canvas, middles, haunts)
+        canvas.clip(None)
+        self._panel.draw(canvas, t, normalized, task_error, hidden)
+        canvas.finish()
+        return canvas
+
+    def _remember(self, t: float, positions: FloatArray) -> float:
+        """Add to the trails, and return the time since the last frame: infinite for the first."""
+        if self._trail and t < self._trail[-1][0]:
+            self._restart()
+        elapsed = t - self._trail[-1][0] if self._trail else math.inf
+        if len(self._trail) > 1 and t - self._trail[-2][0] < TRAIL / 100:
+            self._trail.pop()  # finer than can be seen
+        self._trail.append((t, positions))
+        while self._trail[0][0] < t - TRAIL:
+            self._trail.popleft()
+        return elapsed
+
+    def _follow(self, positions: FloatArray, ghosts: FloatArray, elapsed: float) -> None:
+        final = self._beliefs.final_half_widths()
+        points = np.concatenate([positions, ghosts - final, ghosts + final])
+        points = points[np.all(np.isfinite(points), axis=1)]
+        self._camera.follow(np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), elapsed)
+
+    def _pixels(self, points: FloatArray, agents: IntArray) -> FloatArray:
+        """(..., K, 2) pixels of points (..., K, d) in m that belong to `agents` (K,)."""
+        if points.shape[-1] == 1:
+            pixels = self._camera.pixels(np.concatenate([points, np.zeros_like(points)], axis=-1))
+            pixels[..., 1] = self._rows[agents]
+        else:
+            pixels = self._camera.pixels(points)
+        return np.clip(pixels, -9999.0, 9999.0)  # what is far out of view has to fit into pygame's integers
+
+    def _draw_grid(self, canvas: Canvas) -> None:
+        left, top, width, height = self._map
+        size = round(11 * self._unit)
+        for x, text in self._camera.ticks(0):
+            canvas.line(np.array([[x, top], [x, top + height]]), PALE, 1.0)
+            canvas.text(text, (x, top + height + 10 * self._unit), size, color=SOFT, anchor=(0.5, 0.5))
+        middle = left + width / 2, top + height + 30 * self._unit
+        canvas.text("first coordinate (m)", middle, size, color=SOFT, anchor=(0.5, 0.5))
+        if self._fleet.position_dim > 1:
+            for y, text in self._camera.ticks(1):
+                canvas.line(np.array([[left, y], [left + width, y]]), PALE, 1.0)
+                canvas.text(text, (left - 6 * self._unit, y), size, color=SOFT, anchor=(1.0, 0.5))
+            middle = 11 * self._unit, top + height / 2
+            canvas.text("second coordinate (m)", middle, size, color=SOFT, anchor=(0.5, 0.5), upright=True)
+        corners = np.array([[left, top], [left + width, top], [left + width, top + height], [left, top + height]])
+        canvas.polygon(corners, "#BBBBBB", 1.0)
+        canvas.text(self._title, (left, top / 2), round(14 * self._unit), room=self._size[0] - 2 * left)
+
+    def _draw_boxes(self, canvas: Canvas, t: float, ghosts: FloatArray) -> int:
+        """Draw the guaranteed boxes, and return how many are so large that no edge is in view."""
+        left, top, width, height = self._map
+        half, targets = self._beliefs.half_widths(t), np.array(self._beliefs.targets, int)
+        low, high = self._pixels(ghosts - half, targets), self._pixels(ghosts + half, targets)
+        hidden = 0
+        for target, (x1, y1), (x2, y2) in zip(targets, low, high, strict=True):
+            if not np.isfinite([x1, y1, x2, y2]).all():
+                continue
+            if ghosts.shape[1] == 1:
+                y1, y2 = y1 + 1.8 * self._radius, y2 - 1.8 * self._radius
+            canvas.box((x1, y2, x2 - x1, y1 - y2), self._look[target].color, min(0.1, 0.3 / len(targets)))
+            hidden += x1 < left and x2 > left + width and y2 < top and y1 > top + height
+        return hidden
+
+    def _draw_trails(self, canvas: Canvas, t: float) -> None:
+        times = np.array([time for time, _ in self._trail])
+        paths = self._pixels(np.array([positions for _, positions in self._trail]), np.arange(len(self._look)))
+        fresh = np.ceil((1.0 - (t - times) / TRAIL) * _FADES).astype(int)  # 0 for the oldest
+        strength = 0.3 if self._crowded else 0.6
+        for shade in range(1, _FADES + 1):
+            places = np.flatnonzero(fresh == shade)
+            if not places.size:
+                continue
+            part = paths[max(0, places[0] - 1) : places[-1] + 1]  # from where the shade before ends
+            for agent, look in enumerate(self._look):
+                path = part[:, agent]
+                canvas.line(path[np.isfinite(path[:, 0])], mix(look.color, strength * shade / _FADES), 2.0 * self._thin)
+
+    def _draw_edges(self, canvas: Canvas, middles: FloatArray) -> None:
+        for i, j in self._edges:
+            if np.isfinite(middles[[i, j]]).all():
+                canvas.line(middles[[i, j]], EDGE_COLOR, 2.0 * self._thin)
+        for i, j in self._tasks:
+            if np.isfinite(middles[[i, j]]).all():
+                draw_task_edge(canvas, middles[[i, j]], self._unit, self._thin, beside=(i, j) in self._heard)
+
+    def _draw_agents(self, canvas: Canvas, x: FloatArray, middles: FloatArray) -> None:
+        turned = angles(self._headings, x)
+        for agent in np.flatnonzero(np.isfinite(middles).all(axis=1)).tolist():
+            at, look = middles[agent], self._look[agent]
+            watching = agent == self.observer and bool(self._beliefs.targets)
+            draw_agent(canvas, look, at, turned[agent], self._radius, leader=agent in self._leaders, ring=watching)
+
+    def _draw_ghosts(self, canvas: Canvas, estimates: FloatArray, middles: FloatArray, haunts: FloatArray) -> None:
+        turned = self._beliefs.headings(estimates)
+        for target, at, heading in zip(self._beliefs.targets, haunts, turned, strict=True):
+            if not np.isfinite(at).all():
+                continue
+            color = self._look[target].color
+            if np.isfinite(middles[target]).all():
+                canvas.line(np.array([at, middles[target]]), color, 1.0 * self._unit)
+            canvas.marker(1.55 * self._radius * self._look[target].outline, at, heading, color, 1.5 * self._unit)
+
+    def _draw_labels(self, canvas: Canvas, middles: FloatArray, haunts: FloatArray) -> None:
+        """Write short names where they cover no marker, with a line to their own where that isn't near."""
+        size = round(12 * self._unit)
+        reach = np.full(len(middles), 1.2 * self._radius)
+        ghost = 2.0 * self._radius
+        reach[[self.observer] * bool(self._beliefs.targets)] = ghost
+        for target, haunt in zip(self._beliefs.targets, haunts, strict=True):
+            if np.hypot(*(haunt - middles[target])) < ghost:
+                reach[target] = ghost
+        shown = [agent for agent in self._labelled if np.isfinite(middles[agent]).all()]
+        extent = np.array([canvas.measure(self._names[agent], size) for agent in shown]).reshape(-1, 2)
+        markers = [
+            np.hstack([middles - reach[:, None], middles + reach[:, None]]),
+            np.hstack([haunts - ghost, haunts + ghost]),
+        ]
+        taken = np.concatenate(markers)
+        taken = taken[np.isfinite(taken).all(axis=1)]
+        places = self._labels.place(middles[shown], extent, reach[shown], taken, self._map)
+        for number, (middle, far) in places.items():
+            if far:
+                canvas.line(np.array([middle, middles[shown[number]]]), SOFT, 0.75)
+            text = self._names[shown[number]]
+            canvas.text(text, tuple(middle), size, anchor=(0.5, 0.5), halo=True)

@@ -1,0 +1,159 @@
+"""What a rendered frame shows, before it is drawn: each type's look, short names, and what one agent believes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from khop_env.observers import FloatArray, FunnelBank, IntArray, ObserverDesign
+from khop_env.physics import AgentModel, Fleet
+
+# M. Okabe and K. Ito, Color Universal Design, 2008: told apart by colour-blind readers, too; yellow left out (too pale)
+# and reddish purple kept for task edges
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#000000")
+TASK_COLOR = "#CC79A7"
+EDGE_COLOR = "#A8A8A8"
+LEADER_COLOR = "#F0E442"
+ALARM_COLOR = "#D55E00"
+INK, SOFT, PALE = "#222222", "#666666", "#ECECEC"
+
+TRAIL = 2.0  # s
+
+
+def _regular(corners: int) -> FloatArray:
+    turns = np.arange(corners) * 2.0 * np.pi / corners
+    return np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+
+
+_SHAPES = {  # corners for a radius of about one, heading along the first axis
+    "circle": _regular(32),
+    "square": 0.88 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]),
+    "arrow": np.array([[1.4, 0], [-0.95, 0.9], [-0.5, 0], [-0.95, -0.9]]),
+    "ship": np.array([[1.6, 0], [0.6, 0.75], [-1.1, 0.75], [-1.1, -0.75], [0.6, -0.75]]),
+    "diamond": 1.25 * _regular(4),
+    "triangle": 1.3 * _regular(3)[:, ::-1],
+    "hexagon": 1.1 * _regular(6),
+}
+_USUAL_SHAPE = {"integrator": "circle", "drifter": "circle", "cart": "square", "unicycle": "arrow", "vessel": "ship"}
+_POINTED, _ROUND = ("arrow", "ship", "triangle"), ("diamond", "triangle", "hexagon", "square", "circle")
+_FAR = 1e9  # m: a state that ran further away, or isn't finite, isn't drawn
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the agents of one type are drawn.
+
+    Attributes:
+        color: "#RRGGBB".
+        outline: (K, 2) corners of the marker, heading along the first axis, for a radius of one.
+    """
+
+    color: str
+    outline: FloatArray
+
+
+def looks(models: Sequence[AgentModel]) -> dict[str, Look]:
+    """A colour and a shape for each type, no two alike while there are any left; agents with a heading are pointed."""
+    free = list(_SHAPES)
+    found: dict[str, Look] = {}
+    for model in models:
+        if model.type in found:
+            continue
+        fitting = [_USUAL_SHAPE.get(model.type), *(_POINTED if "heading" in model.states else _ROUND), *_SHAPES]
+        shape = next(name for name in fitting if name in free)
+        free = [name for name in free if name != shape] or list(_SHAPES)
+        found[model.type] = Look(COLORS[len(found) % len(COLORS)], _SHAPES[shape])
+    return found
+
+
+def short_names(fleet: Fleet) -> list[str]:
+    """Per agent its number, after as many letters of its type as tell the types apart."""
+    kinds = list(dict.fromkeys(model.type for model in fleet.models))
+    length = next(n for n in range(len(max(kinds, key=len)) + 1) if len({kind[:n] for kind in kinds}) == len(kinds))
+    return [model.type[:length] + name.rpartition("_")[2] for model, name in zip(fleet.models, fleet.ids, strict=True)]
+
+
+def mix(color: str, share: float) -> tuple[int, int, int]:
+    """A share of a colour "#RRGGBB" in white."""
+    red, green, blue = (round(255 + share * (int(color[k : k + 2], 16) - 255)) for k in (1, 3, 5))
+    return red, green, blue
+
+
+def undirected(edges: IntArray) -> list[tuple[int, int]]:
+    """Each undirected pair of (E, 2) edges once."""
+    return sorted({(min(i, j), max(i, j)) for i, j in edges.tolist() if i != j})
+
+
+def neediest(design: ObserverDesign, task_edges: IntArray) -> int:
+    """The agent with most task edges to agents that it can't hear, the first of several."""
+    unheard = [i for i, j in task_edges.tolist() if not design.communication.has_edge(i, j)]
+    return int(np.bincount(unheard, minlength=len(design.fleet)).argmax())
+
+
+def headings(fleet: Fleet) -> IntArray:
+    """(N,) where the fleet's state has each agent's heading; -1 for agents without one."""
+    offsets = fleet.state_offset[:-1].tolist()
+    return np.array(
+        [
+            offset + list(model.states).index("heading") if "heading" in model.states else -1
+            for offset, model in zip(offsets, fleet.models, strict=True)
+        ]
+    )
+
+
+class Beliefs:
+    """What one agent believes of the others: where they are, and how far off that may be.
+
+    Args:
+        design: the observers.
+        observer: index of the agent.
+
+    Attributes:
+        targets: indices of the agents that it estimates.
+    """
+
+    def __init__(self, design: ObserverDesign, observer: int) -> None:
+        fleet, layout = design.fleet, design.states.layout
+        slots = {target: offset for (who, target), offset in layout.slot.items() if who == observer}
+        self.targets = sorted(slots)
+        first = {int(target): int(row) for target, row in zip(layout.target, layout.plan[:, 4], strict=True)}
+        d = min(2, fleet.position_dim)
+        place = [fleet.position_index[j, :d] - fleet.state_offset[j] for j in self.targets]
+        self._columns = np.array([slots[j] + p for j, p in zip(self.targets, place, strict=True)], int).reshape(-1, d)
+        rows = np.array([first[j] + p for j, p in zip(self.targets, place, strict=True)], int).reshape(-1)
+        self._bound = FunnelBank([design.states.bounds[row] for row in rows])
+        own = headings(fleet)
+        self._heading = [slots[j] + own[j] - fleet.state_offset[j] if own[j] >= 0 else -1 for j in self.targets]
+
+    def positions(self, estimates: FloatArray) -> FloatArray:
+        """(K, d) believed positions in m, d at most 2; nan where they make no sense. `estimates` is (P,)."""
+        return sensible(estimates[self._columns])
+
+    def headings(self, estimates: FloatArray) -> FloatArray:
+        """(K,) believed headings in rad, 0 where there are none. `estimates` is (P,)."""
+        return angles(self._heading, estimates)
+
+    def half_widths(self, t: float) -> FloatArray:
+        """(K, d) of the box around each belief that the observers guarantee to hold the target, in m, at `t` s."""
+        rows = len(self._bound)
+        return self._bound.evaluate(np.array([t]), np.empty((rows, 1))).reshape(self._columns.shape)
+
+    def final_half_widths(self) -> FloatArray:
+        """(K, d) of the same as time goes on."""
+        return self._bound.infimum().reshape(self._columns.shape)
+
+
+def sensible(positions: FloatArray) -> FloatArray:
+    """(K, d) positions, nan where they are not finite or absurdly far away."""
+    with np.errstate(invalid="ignore"):
+        near = np.all(np.abs(positions) < _FAR, axis=-1, keepdims=True)
+    return np.where(near, positions, np.nan)
+
+
+def angles(columns: Sequence[int] | IntArray, values: FloatArray) -> FloatArray:
+    """(K,) `values` at the columns, and 0 where the column is -1 or the value isn't finite."""
+    columns = np.asarray(columns, int)
+    chosen = values[np.maximum(columns, 0)] if columns.size else np.zeros(0)
+    return np.where((columns >= 0) & np.isfinite(chosen), chosen, 0.0)

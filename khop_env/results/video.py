@@ -1,0 +1,180 @@
+"""A recording as a film: the frames that the environment renders, in an .mp4 or .gif file."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import itertools
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.results.metrics import consensus_error
+from khop_env.results.recording import ObserverRecord, Progress, Recording
+from khop_env.scenarios import Scenario
+
+if TYPE_CHECKING:
+    from khop_env.env.rendering import Renderer
+
+SIZES = {".mp4": (900, 720), ".gif": (720, 576)}
+"""Width and height in pixels by ending; even, as H.264 wants them."""
+
+_PACKAGES = {".mp4": ("pygame", "imageio_ffmpeg"), ".gif": ("pygame", "PIL")}
+
+
+def require_video(path: str | Path) -> None:
+    """Make sure that a film can be written, before there is something to film.
+
+    Args:
+        path: of the file; its ending decides the format.
+
+    Raises:
+        ValueError: for another ending than .mp4 and .gif.
+        ModuleNotFoundError: if a package is missing; the message says what to install.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in SIZES:
+        raise ValueError(f"{path}: a video's name ends in {' or '.join(SIZES)}; got {ending or 'no ending'!r}")
+    missing = [name for name in _PACKAGES[ending] if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ModuleNotFoundError(f"{path}: videos need {' and '.join(missing)}: pip install 'khop_env[render]'")
+    if ending == ".mp4":
+        _ffmpeg()
+
+
+def write_video(
+    recording: Recording,
+    scenario: Scenario,
+    path: str | Path,
+    *,
+    observer: str | int | None = None,
+    fps: int = 25,
+    speed: float = 1.0,
+    progress: Progress | None = None,
+) -> Path:
+    """Film a run: agents, edges, and what one agent believes of those it can't hear.
+
+    The film has `fps` frames for each second it lasts, each showing the sample that is nearest in time, and the
+    last one the end. Where the recording has fewer samples a second, some are shown twice.
+
+    Args:
+        recording: of the run.
+        scenario: what was run.
+        path: of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
+        observer: id or index of the agent whose beliefs are shown; by default the one with most task edges to agents
+            that it can't hear.
+        fps: frames per second, up to 50.
+        speed: seconds of the run per second of the film.
+        progress: told now and then how far it is.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: for an ending, an observer, an fps or a speed that won't do.
+        ModuleNotFoundError: if a package is missing; the message says what to install.
+        OSError: if the file can't be written; nothing is left in its place.
+    """
+    require_video(path)
+    from khop_env.env.rendering import Renderer
+
+    path = Path(path)
+    if not (1 <= fps <= 50 and 0.0 < speed < np.inf):
+        raise ValueError(f"expected fps from 1 to 50 and a positive, finite speed; got fps={fps!r}, speed={speed!r}")
+    shown = None if observer is None else recording.fleet.agent(observer)
+    edges = np.array([*scenario.task.edges, *((j, i) for i, j in scenario.task.edges)], np.int64).reshape(-1, 2)
+    renderer = Renderer(recording.design, edges, observer=shown, title=scenario.name, size=SIZES[path.suffix.lower()])
+    samples = _samples(recording, fps / speed)
+    frames = _frames(renderer, recording, samples, progress)
+    try:
+        if path.suffix.lower() == ".gif":
+            first, middle, last = samples[0], samples[len(samples) // 2], samples[-1]
+            _write_gif(path, frames, fps, np.vstack([*_frames(renderer, recording, [first, middle, last])]))
+        else:
+            _write_mp4(path, frames, fps)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+        raise
+    return path
+
+
+def _samples(recording: Recording, per_second: float) -> list[int]:
+    """Indices of the samples nearest to 0, 1, 2, ... frames' time; the last frame shows the last sample."""
+    time = recording.time
+    wanted = time[0] + np.arange(max(1, round((time[-1] - time[0]) * per_second))) / per_second
+    wanted[-1] = time[-1]
+    later = np.searchsorted(time, wanted).clip(1, len(time) - 1) if len(time) > 1 else np.zeros(len(wanted), int)
+    return np.where(wanted - time[later - 1] < time[later] - wanted, later - 1, later).tolist()
+
+
+def _frames(
+    renderer: Renderer, recording: Recording, samples: Sequence[int], progress: Progress | None = None
+) -> Iterator[NDArray[np.uint8]]:
+    for number, k in enumerate(samples):
+        largest = max(_largest_ratio(kind, k) for kind in (recording.states, recording.inputs))
+        error = float(consensus_error(recording.fleet, recording.x[k]))
+        yield renderer.frame(float(recording.time[k]), recording.x[k], recording.states.estimate[k], largest, error)
+        if progress is not None:
+            progress((number + 1) / len(samples))
+
+
+def _largest_ratio(kind: ObserverRecord, sample: int) -> float:
+    """Largest |disagreement| / funnel of one kind of observer in one sample; 0 if there are none."""
+    layout = kind.funnels.layout
+    funnels = kind.funnels.rho.evaluate(kind.time[[sample]], np.empty((layout.rows, 1)))
+    return float(np.max(np.abs(kind.disagreement[sample]) / funnels[layout.column_row, 0], initial=0.0))
+
+
+def _write_mp4(path: Path, frames: Iterator[NDArray[np.uint8]], fps: int) -> None:
+    first = next(frames)
+    height, width, _ = first.shape
+    taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
+    given = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", str(path.resolve())]
+    command = [_ffmpeg(), "-loglevel", "error", "-y", *taken, *given]
+    with tempfile.TemporaryFile() as said:
+        with (
+            contextlib.suppress(BrokenPipeError),  # it gave up, and says why
+            subprocess.Popen(command, stdin=subprocess.PIPE, stderr=said) as process,
+        ):
+            assert process.stdin is not None
+            try:
+                for frame in itertools.chain([first], frames):
+                    process.stdin.write(frame.data)
+            except BaseException:
+                process.kill()
+                raise
+        if process.returncode:
+            said.seek(0)
+            raise OSError(f"ffmpeg: {said.read().decode(errors='replace').strip() or process.returncode}")
+
+
+def _ffmpeg() -> str:
+    """Path of the program.
+
+    Raises:
+        ModuleNotFoundError: if there is none for this machine.
+    """
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    try:
+        return str(get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise ModuleNotFoundError(f"videos in .mp4 need ffmpeg, or take .gif: {error}") from None
+
+
+def _write_gif(path: Path, frames: Iterator[NDArray[np.uint8]], fps: int, colors: NDArray[np.uint8]) -> None:
+    """`colors` is a picture that all frames take their palette from: what doesn't change isn't stored again."""
+    from PIL import Image
+
+    palette = Image.fromarray(colors).quantize(256, Image.Quantize.MAXCOVERAGE)
+    entries = np.array(palette.getpalette()).reshape(-1, 3)
+    entries[entries.min(axis=1) > 247] = 255  # the ground stays white
+    palette.putpalette(entries.ravel().tolist())
+    pictures = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    next(pictures).save(path, save_all=True, append_images=pictures, duration=round(100 / fps) * 10, loop=0)

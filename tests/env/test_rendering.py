@@ -1,0 +1,343 @@
+"""Frames show what they say: agents at their places, ghosts in boxes as wide as the bound, and no trace of the past."""
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import khop_env
+from khop_env.env.rendering import Renderer, canvas
+from khop_env.env.rendering.camera import Camera, Labels
+from khop_env.env.rendering.scene import ALARM_COLOR, COLORS, Beliefs, looks, neediest, short_names
+from khop_env.observers import Exponential, ObserverDesign
+from khop_env.physics import DoubleIntegrator, DriftingIntegrator, Fleet, SingleIntegrator, SurfaceVessel, Unicycle
+
+DELTA = Exponential(10.0, 0.5, 5.0)
+TASK = np.array([[0, 2], [2, 0], [1, 2]])
+
+
+def rgb(color: str) -> np.ndarray:
+    return np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)])
+
+
+BLUE = rgb(COLORS[0])
+
+
+POINTS = (SingleIntegrator(),) * 3
+
+
+def design(models=POINTS, graph=None, k=2) -> ObserverDesign:
+    """A path on which agents two apart estimate each other."""
+    return ObserverDesign(Fleet(models), graph or nx.path_graph(len(models)), k, DELTA, Exponential(5.0, 1.0, 5.0))
+
+
+def renderer(**options) -> Renderer:
+    return Renderer(design(), TASK, **options)
+
+
+def scene(t=0.0, x=(0.0, 0.0, 3.0, 1.0, 1.0, -2.0), offset=0.0, normalized=0.5):
+    """Arguments of `frame`: each agent believed to be `offset` metres off in both coordinates."""
+    x = np.array(x)
+    return t, x, x[design().states.layout.column_source] + offset, normalized
+
+
+def at(drawn: Renderer, frame: np.ndarray, point) -> np.ndarray:
+    """The colour at a place in the plane."""
+    column, row = np.round(drawn._camera.pixels(np.array(point, float))).astype(int)
+    return frame[row, column].astype(int)
+
+
+def near(color, other, tolerance=40) -> bool:
+    return bool(np.abs(np.asarray(color) - other).max() <= tolerance)
+
+
+class TestFrame:
+    def test_is_a_fresh_picture(self):
+        drawn = renderer(size=(640, 480))
+        first = drawn.frame(*scene())
+        kept = first.copy()
+        second = drawn.frame(*scene(1.0, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0)))
+        assert first.shape == (480, 640, 3)
+        assert first.dtype == np.uint8
+        assert first.flags.writeable
+        assert first.flags.c_contiguous
+        assert not np.shares_memory(first, second)
+        assert np.array_equal(first, kept)
+        assert not np.array_equal(first, second)
+
+    def test_same_scene_same_picture(self):
+        assert np.array_equal(renderer().frame(*scene()), renderer().frame(*scene()))
+
+    def test_agents_are_where_they_are(self):
+        drawn = renderer()
+        first = drawn.frame(*scene(0.0))
+        for place in ((0, 0), (3, 1), (1, -2)):
+            assert near(at(drawn, first, place), BLUE)
+        assert not near(at(drawn, first, (2, 0)), BLUE)
+        moved = drawn.frame(*scene(5.0, x=(2.0, 0.0, 3.0, 1.0, 1.0, -2.0)))
+        assert near(at(drawn, moved, (2, 0)), BLUE)
+        assert not near(at(drawn, moved, (0, 0)), BLUE)
+
+    def test_north_is_up(self):
+        drawn = renderer()
+        drawn.frame(*scene())
+        assert drawn._camera.pixels(np.array([0.0, 1.0]))[1] < drawn._camera.pixels(np.array([0.0, 0.0]))[1]
+
+    @pytest.mark.parametrize("t", [0.8, 1.0, 9.0])
+    def test_boxes_are_as_wide_as_the_bound(self, t):
+        """Agent 0 believes agent 2 to be 0.2 m off; the bound's edges stand delta(t) from the belief."""
+        drawn = renderer(observer=0)
+        frame = drawn.frame(*scene(t, offset=0.2))
+        believed, delta = np.array([1.2, -1.8]), DELTA(t)
+        steps = np.arange(-8, 9)  # pixels across the edge
+        for side in ((-1.0, -0.5), (1.0, -0.5), (0.0, -1.0), (0.0, 1.0)):  # where nothing else is drawn
+            edge, outwards = believed + delta * np.array(side), np.trunc(side)
+            red = [at(drawn, frame, edge + n * drawn._camera.meters * outwards)[0] for n in steps]
+            assert min(red) < 130, "no edge there"
+            assert abs(steps[np.argmin(red)]) <= 1
+        inside, outside = believed + 0.8 * delta * np.array([1, -1]), believed + 1.1 * delta * np.array([1, -1])
+        assert at(drawn, frame, inside)[0] < at(drawn, frame, outside)[0]  # tinted
+
+    def test_boxes_larger_than_the_view_are_counted(self):
+        drawn = renderer(observer=0)
+        drawn.frame(*scene(0.0))
+        believed = np.array([[1.0, -2.0]])
+        assert drawn._draw_boxes(drawn._canvas, 0.0, believed) == 1
+        assert drawn._draw_boxes(drawn._canvas, 9.0, believed) == 0
+
+    def test_a_ghost_is_drawn_at_the_belief(self):
+        drawn = renderer(observer=0)
+        apart = drawn.frame(*scene(1.0, offset=0.4))
+        radius = 1.55 * drawn._radius * drawn._camera.meters
+        assert near(at(drawn, apart, (1.4 + radius, -1.6)), BLUE, 60)
+        assert not near(at(drawn, apart, (1.4, -1.6 + 0.5 * radius)), BLUE, 60)  # hollow
+
+    def test_trails_end_with_the_episode(self):
+        drawn = renderer()
+        first = drawn.frame(*scene(0.0))
+        for t in (0.5, 1.0, 1.5):
+            later = drawn.frame(*scene(t, x=(t, t, 3.0, 1.0, 1.0, -2.0)))
+        assert at(drawn, later, (1.2, 1.2))[0] < 225  # the trail: darker than white and the grid
+        assert at(drawn, first, (1.2, 1.2))[0] > 225
+        assert np.array_equal(drawn.frame(*scene(0.0)), first)
+
+    def test_the_guarantee_broken_is_alarming(self):
+        def alarmed(normalized):
+            frame = renderer().frame(*scene(normalized=normalized))
+            return int((np.abs(frame.astype(int) - rgb(ALARM_COLOR)).max(axis=2) < 5).sum())
+
+        assert alarmed(0.99) == 0
+        assert alarmed(1.01) > 1000
+        assert alarmed(np.nan) > 1000
+        assert alarmed(np.inf) > 1000
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -1e300, 1e12])
+    def test_states_that_ran_away_leave_the_others_in_view(self, value):
+        drawn = renderer()
+        with np.errstate(all="raise"):
+            frame = drawn.frame(*scene(0.0, x=(value, 0.0, 3.0, 1.0, 1.0, -2.0), normalized=np.nan))
+            drawn.frame(*scene(1.0, x=(value,) * 6))
+        drawn = renderer()
+        frame = drawn.frame(*scene(0.0, x=(value, 0.0, 3.0, 1.0, 1.0, -2.0)))
+        assert near(at(drawn, frame, (3, 1)), BLUE)
+
+    @pytest.mark.parametrize("dim", [1, 3])
+    def test_fleets_on_a_line_and_in_space(self, dim):
+        fleet = design((SingleIntegrator(dim=dim),) * 3)
+        drawn = Renderer(fleet, TASK, leaders=[1])
+        x = np.zeros(3 * dim)
+        x[dim] = 1.0
+        frame = drawn.frame(2.0, x, x[fleet.states.layout.column_source], 0.1)
+        column, middle = drawn._camera.pixels(np.zeros(2)).round().astype(int)
+        for row in drawn._rows.round().astype(int)[[0, 2]] if dim == 1 else [middle]:
+            assert near(frame[row, column], BLUE)
+        assert drawn._camera.pixels(np.array([1.0, 0.0]))[0] > column + 100
+
+    def test_without_anyone_to_estimate(self):
+        alone = Renderer(design(graph=nx.complete_graph(3)), TASK)
+        assert alone.frame(0.0, np.arange(6.0), np.zeros(0), 0.0).shape == (720, 900, 3)
+
+
+class TestWhoIsShown:
+    def test_the_neediest_by_default(self):
+        fleet = design((SingleIntegrator(),) * 5, k=4)
+        assert neediest(fleet, np.array([[0, 1], [1, 0], [3, 1], [3, 0], [4, 0]])) == 3
+        assert neediest(fleet, np.array([[4, 0], [2, 0]])) == 2
+        assert Renderer(fleet, np.zeros((0, 2), int)).observer == 0
+
+    def test_beliefs_are_each_target_s_own(self):
+        """In a fleet of agents that differ in their states and bounds, against the layout's own tables."""
+        fleet = Fleet([SurfaceVessel(), SingleIntegrator(), Unicycle(), DoubleIntegrator(), SurfaceVessel()])
+        bounds = {
+            i: [Exponential(9.0 + i, 0.1 * (i + 1) + 0.01 * c, 1.0) for c in range(model.n)]
+            for i, model in enumerate(fleet.models)
+        }
+        mixed = ObserverDesign(fleet, nx.path_graph(5), 4, bounds, Exponential(5.0, 1.0, 5.0))
+        estimates = np.random.default_rng(0).normal(size=mixed.states.layout.size)
+        for observer in range(5):
+            beliefs = Beliefs(mixed, observer)
+            assert tuple(beliefs.targets) == mixed.neighborhoods[observer]
+            for number, j in enumerate(beliefs.targets):
+                start = mixed.states.layout.slot[observer, j]
+                believed = dict(zip(fleet.models[j].states, estimates[start:], strict=False))
+                assert beliefs.positions(estimates)[number].tolist() == [believed["x"], believed["y"]]
+                assert beliefs.headings(estimates)[number] == believed.get("heading", 0.0)
+                expected = [float(bounds[j][c](2.0)) for c in (0, 1)]
+                assert beliefs.half_widths(2.0)[number] == pytest.approx(expected, rel=1e-12)
+                assert beliefs.final_half_widths()[number].tolist() == [bounds[j][c].final for c in (0, 1)]
+
+    def test_no_such_agent(self):
+        with pytest.raises(ValueError, match="no agent 7"):
+            renderer(observer=7)
+        with pytest.raises(ValueError, match="no agent 9"):
+            renderer(leaders=[9])
+
+    def test_types_look_different_each(self):
+        class Strange(DriftingIntegrator):
+            type = "strange"
+
+        class Headed(Unicycle):
+            type = "headed"
+
+        models = SingleIntegrator(), Strange(), DoubleIntegrator(), Unicycle(), SurfaceVessel(), Headed()
+        found = looks([*models, *models])
+        assert len(found) == 6
+        assert len({look.color for look in found.values()}) == 6
+        assert len({look.outline.tobytes() for look in found.values()}) == 6
+
+    def test_short_names(self):
+        class Cargo(DriftingIntegrator):
+            type = "cargo"
+
+        assert short_names(Fleet([SingleIntegrator()] * 2)) == ["0", "1"]
+        assert short_names(Fleet([SingleIntegrator(), Unicycle(), SingleIntegrator()])) == ["i0", "u0", "i1"]
+        assert short_names(Fleet([DoubleIntegrator(), Cargo()])) == ["cart0", "carg0"]
+
+
+class TestCamera:
+    RECT = (50.0, 40.0, 600.0, 500.0)
+
+    @given(
+        st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=1, max_size=5),
+        st.lists(st.floats(0.0, 2.0), min_size=1, max_size=4),
+    )
+    def test_what_is_followed_is_in_view(self, points, times):
+        camera = Camera(self.RECT, margin=30.0)
+        for number, elapsed in enumerate(times):
+            followed = np.array(points) * (1.0 + number)
+            camera.follow(followed, elapsed)
+            pixels = camera.pixels(followed)
+            assert np.all(pixels >= (80 - 1e-6, 70 - 1e-6))
+            assert np.all(pixels <= (620 + 1e-6, 510 + 1e-6))
+
+    def test_closes_in_slowly_and_then_stays(self):
+        camera = Camera(self.RECT, margin=30.0)
+        wide, narrow = np.array([[-5.0, 0.0], [5.0, 0.0]]), np.array([[-1.0, 0.0], [1.0, 0.0]])
+        camera.follow(wide, np.inf)
+        start = camera.meters
+        camera.follow(narrow, 0.04)
+        assert 0.9 * start < camera.meters < start
+        for _ in range(1000):
+            camera.follow(narrow, 0.04)
+        assert camera.meters == pytest.approx(start / 5)
+
+    @given(st.floats(1e-3, 1e6), st.floats(-1e4, 1e4))
+    def test_ticks_are_round_and_apart(self, scale, middle):
+        camera = Camera(self.RECT, margin=30.0)
+        camera.follow(middle + scale * np.array([[-1.0, -1.0], [1.0, 1.0]]), np.inf)
+        for axis in (0, 1):
+            places, texts = zip(*camera.ticks(axis), strict=True)
+            assert np.all(np.abs(np.diff(places)) >= 70 - 1e-3)
+            assert len(set(texts)) == len(texts)
+
+
+def test_labels_cover_nothing():
+    """Agents that have almost met: each label that is placed is free of markers and of other labels."""
+    rng = np.random.default_rng(0)
+    anchors, sizes, radii = rng.normal(300.0, 25.0, (25, 2)), np.tile([18.0, 12.0], (25, 1)), np.full(25, 7.0)
+    taken = np.hstack([anchors - 7.0, anchors + 7.0])
+    labels = Labels()
+    places = labels.place(anchors, sizes, radii, taken, (0.0, 0.0, 600.0, 600.0))
+    assert len(places) > 15
+    middles = np.array([middle for middle, _ in places.values()])
+    apart = np.abs(middles[:, None] - middles[None])
+    assert np.all((apart[..., 0] >= 18 - 1e-9) | (apart[..., 1] >= 12 - 1e-9) | np.eye(len(middles), dtype=bool))
+    from_markers = np.abs(middles[:, None] - anchors[None])
+    assert np.all((from_markers[..., 0] >= 9 + 7 - 1e-9) | (from_markers[..., 1] >= 6 + 7 - 1e-9))
+    again = labels.place(anchors + 0.01, sizes, radii, taken + 0.01, (0.0, 0.0, 600.0, 600.0))
+    assert {n: far for n, (_, far) in again.items()} == {n: far for n, (_, far) in places.items()}
+    for number, (middle, _) in again.items():
+        assert middle == pytest.approx(places[number][0] + 0.01)  # labels don't jump
+
+
+class TestAsAnObject:
+    @pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+    def test_copies_go_on_alike(self, copied):
+        drawn = renderer(title="two of them")
+        drawn.frame(*scene(0.0))
+        other = copied(drawn)
+        following = scene(0.5, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0))
+        assert np.array_equal(drawn.frame(*following), other.frame(*following))
+
+    def test_without_pygame_it_says_what_to_install(self, monkeypatch):
+        canvas.load_pygame.cache_clear()
+        monkeypatch.setitem(sys.modules, "pygame", None)
+        with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
+            renderer()
+
+
+class TestWindow:
+    @pytest.fixture(autouse=True)
+    def no_screen(self, monkeypatch):
+        monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+    def test_shows_the_frame(self):
+        pygame = canvas.load_pygame()
+        drawn = renderer()
+        drawn.show(*scene())
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        assert np.array_equal(shown, renderer().frame(*scene()))
+        assert pickle.loads(pickle.dumps(drawn))._window is None  # one can't be copied
+        drawn.close()
+        drawn.close()
+        assert not pygame.display.get_init()
+        drawn.show(*scene())  # opens again
+        drawn.close()
+
+    def test_closed_by_hand_it_stays_closed(self):
+        pygame = canvas.load_pygame()
+        drawn = renderer()
+        drawn.show(*scene())
+        pygame.event.post(pygame.event.Event(pygame.QUIT))
+        drawn.show(*scene(0.1))
+        assert not pygame.display.get_init()
+        drawn.show(*scene(0.2))
+        assert not pygame.display.get_init()
+        assert drawn.frame(*scene(0.3)).shape == (720, 900, 3)
+        drawn.close()
+
+    def test_without_a_display_there_are_neither_errors_nor_warnings(self):
+        script = (
+            "import sys; sys.path.insert(0, 'tests/env'); import test_rendering as here\n"
+            "drawn = here.renderer(); frame = drawn.frame(*here.scene()); assert frame.min() < 100\n"
+            "import pygame; assert not pygame.display.get_init()\n"
+            "drawn.show(*here.scene(0.1)); drawn.show(*here.scene(0.2)); drawn.close()"
+        )
+        hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "PYGAME_HIDE_SUPPORT_PROMPT")
+        root = Path(khop_env.__file__).parents[1]
+        environment = {name: value for name, value in os.environ.items() if name not in hidden}
+        environment["PYTHONPATH"] = str(root)
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", script], cwd=root, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == ""  # pygame's greeting would spoil it
+        assert done.stderr.count("khop_env: there is no display") == 1
