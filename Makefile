@@ -15,11 +15,20 @@ lint: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: .venv/bench
-	$(BIN)/khop bench
+# PEERS=1 installs what environments are compared with, each in an environment of its own (gigabytes, minutes)
+bench: .venv/bench $(if $(PEERS),.peers/mpe2/done .peers/vmas/done .peers/jaxmarl/done)
+	$(BIN)/khop bench $(if $(PEERS),--peers .peers)
+
+.peers/mpe2/done: PACKAGES = mpe2 pygame-ce
+.peers/vmas/done: PACKAGES = vmas torch
+.peers/jaxmarl/done: PACKAGES = jaxmarl jax
+.peers/%/done: constraints.txt
+	$(PYTHON) -m venv .peers/$*
+	.peers/$*/bin/python -m pip install --quiet -c constraints.txt $(PACKAGES)
+	touch $@
 
 clean:
-	rm -rf .venv runs
+	rm -rf .venv .peers runs
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/core: pyproject.toml constraints.txt

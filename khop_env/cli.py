@@ -233,12 +233,15 @@ def export(name: ScenarioArgument) -> None:
 @app.command()
 def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes, rougher numbers.")] = False,
+    peers: Annotated[
+        Path | None, typer.Option(help="Folder with virtual environments mpe2, vmas, jaxmarl to compare with.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure speed and memory against explicit, SciPy's and bare loops."""
+    """Measure speed and memory against explicit, SciPy's and bare loops, and other libraries' environments."""
     from khop_env.bench import benchmark
 
-    result = benchmark(quick=quick, progress=say)
+    result = benchmark(quick=quick, progress=say, peers=peers)
     if as_json:
         _print_json(result)
         return

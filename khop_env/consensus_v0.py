@@ -74,7 +74,7 @@ deep-copied environment continues bit for bit.
 from khop_env import consensus_v0
 
 consensus_v0.parallel_env(scenario="paper", observe="estimate", bounds=False, uniform=True, max_cycles=200,
-control_period=0.05, dt=None, order=None, actuator="direct", reward="agent", effort=0.1, success_radius=None,
+control_period=0.05, dt=None, order=1, actuator="direct", reward="agent", effort=0.1, success_radius=None,
 limit=100.0, threads=1, render_mode=None)
 ```
 
@@ -93,7 +93,8 @@ limit=100.0, threads=1, render_mode=None)
 
 `dt`: the simulator's step in s; the control period has to be a multiple of it, and is one step by default
 
-`order`: order of the simulator's step, 1 or 2; by default the scenario's
+`order`: order of the simulator's step, 1 (default) or 2: actions are held over a control period, so that the closed
+loop is of order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time
 
 `actuator`: "direct" (default), "lag", "slew", "hold", or one of `khop_env.env` with parameters, e.g.
 `Lag(time_constant=0.2)`; all but the first keep the derivative of the inputs bounded, as the input observer's theorem

@@ -75,7 +75,7 @@ deep-copied environment continues bit for bit.
 from khop_env import leader_following_v0
 
 leader_following_v0.parallel_env(scenario="convoy", observe="estimate", bounds=False, uniform=True, max_cycles=200,
-control_period=0.05, dt=None, order=None, actuator="direct", reward="agent", effort=0.1, success_radius=None,
+control_period=0.05, dt=None, order=1, actuator="direct", reward="agent", effort=0.1, success_radius=None,
 limit=100.0, threads=1, render_mode=None,
 leaders=None, follow=None, leader_speed=None, spacing=1.0)
 ```
@@ -105,7 +105,8 @@ m/s, otherwise 0.5
 
 `dt`: the simulator's step in s; the control period has to be a multiple of it, and is one step by default
 
-`order`: order of the simulator's step, 1 or 2; by default the scenario's
+`order`: order of the simulator's step, 1 (default) or 2: actions are held over a control period, so that the closed
+loop is of order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time
 
 `actuator`: "direct" (default), "lag", "slew", "hold", or one of `khop_env.env` with parameters, e.g.
 `Lag(time_constant=0.2)`; all but the first keep the derivative of the inputs bounded, as the input observer's theorem
@@ -144,15 +145,17 @@ from khop_env.scenarios import Scenario
 
 __all__ = ["batched_env", "env", "parallel_env", "raw_env"]
 
+OWN = ("leaders", "follow", "leader_speed", "spacing")
+
 
 def batched_env(scenario: Scenario | str | Path = "convoy", *, num_envs: int = 1, **arguments: Any) -> BatchedEnv:
     """`num_envs` copies as arrays (copies, agents, ...); arguments as listed at the top of this module."""
-    own = {name: arguments.pop(name) for name in ("leaders", "follow", "leader_speed", "spacing") if name in arguments}
+    own = {name: arguments.pop(name) for name in OWN if name in arguments}
 
     def task(chosen: Scenario) -> Task:
         return leader_following(chosen.fleet, chosen.communication, chosen.k, **own)
 
-    return assemble(scenario, task, num_envs, arguments)
+    return assemble(scenario, task, num_envs, arguments, OWN)
 
 
 def parallel_env(

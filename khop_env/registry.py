@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, get_type_hints
+
+import numpy as np
 
 from khop_env.env import BatchedEnv, JointEnv, KHopVectorEnv, Settings, Task
 from khop_env.physics import did_you_mean
@@ -98,6 +100,7 @@ def assemble(
     task: Callable[[Scenario], Task],
     num_envs: int,
     arguments: dict[str, Any],
+    others: Sequence[str] = (),
 ) -> BatchedEnv:
     """The environment of a scenario and a task: what the `*_v0` modules call.
 
@@ -106,15 +109,17 @@ def assemble(
         task: makes the task of the scenario's fleet and graphs.
         num_envs: copies B.
         arguments: of `Settings`, by name.
+        others: the arguments of the environment's own.
 
     Raises:
         TypeError: for an argument that there isn't, naming the nearest.
         ValueError: for a wrong one.
     """
-    settings = Settings.of(arguments)
+    settings = Settings.of(arguments, ("scenario", "render_mode", *others))
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise ValueError(f"num_envs must be a positive integer; got {num_envs!r}")
     chosen = scenario_or_name if isinstance(scenario_or_name, Scenario) else scenario(scenario_or_name)
-    order = chosen.order if settings.order is None else settings.order
-    simulator = chosen.build(integrator=Proximal(order, settings.threads), batch=num_envs)
+    simulator = chosen.build(integrator=Proximal(settings.order, settings.threads), batch=int(num_envs))
     return BatchedEnv(simulator, task(chosen), settings)
 
 

@@ -27,7 +27,7 @@ RANKS = [
 ]
 # Where a third-party package may be imported at all (architecture, last paragraph of the import order).
 HEAVY = {
-    "torch": ("agents",),
+    "torch": ("agents", "khop_env.bench.peers"),  # the peers run in environments of their own
     "ray": ("agents",),
     "stable_baselines3": ("agents", "khop_env.env.sb3"),
     "matplotlib": ("khop_env.results", "khop_env.env.rendering"),

@@ -13,11 +13,13 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents import make_law
+from khop_env.bench.environments import environment_rows
 from khop_env.bench.yardsticks import CompiledPaper, bare_loop
 from khop_env.observers import FloatArray
 from khop_env.scenarios import Scenario, paper, random_geometric
@@ -32,12 +34,13 @@ BATCH = 64
 Progress = Callable[[str], None]
 
 
-def benchmark(quick: bool = False, progress: Progress | None = None) -> dict[str, Any]:
+def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path | None = None) -> dict[str, Any]:
     """Run all benchmarks.
 
     Args:
         quick: a hundredth of the work, to see that everything runs; the figures mean little.
         progress: called with a line before each part.
+        peers: folder with virtual environments of other libraries to compare environments with; None to leave it out.
 
     Returns:
         "machine" and "rows", each row with name, value, unit and target (the bound that the project sets itself).
@@ -55,6 +58,7 @@ def benchmark(quick: bool = False, progress: Progress | None = None) -> dict[str
     say("the solve against its bare arithmetic")
     add("ratio_to_floor", _ratio_to_floor(quick), target="at most 6")
     _growth(add, quick, say)
+    environment_rows(add, quick, say, peers)
     return {"machine": _machine(), "rows": rows}
 
 

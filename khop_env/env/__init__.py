@@ -1,11 +1,12 @@
 """THE API: the same numbers as PettingZoo, Gymnasium and Stable-Baselines3 want them."""
 
 from khop_env.env.actuators import ACTUATORS, Actuator, Direct, Hold, Lag, SlewLimit
-from khop_env.env.batched import INFO_KEYS, BatchedEnv, EnvState
+from khop_env.env.batched import BatchedEnv
 from khop_env.env.joint import JointEnv
 from khop_env.env.layout import Field, ObservationLayout, Slot
 from khop_env.env.parallel import KHopEnv
 from khop_env.env.settings import Settings
+from khop_env.env.state import INFO_KEYS, EnvState
 from khop_env.env.tasks import Task, consensus, formation, leader_following
 from khop_env.env.vector import KHopVectorEnv
 

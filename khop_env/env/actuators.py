@@ -95,9 +95,11 @@ def as_actuator(actuator: str | Actuator) -> Actuator:
     """An actuator by name with its default parameters, or the one given.
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: for an unknown name, or something else.
     """
     if not isinstance(actuator, str):
+        if not callable(actuator) or isinstance(actuator, type):
+            raise ValueError(f"actuator must be a name or an Actuator, e.g. Lag(time_constant=0.2); got {actuator!r}")
         return actuator
     if actuator not in ACTUATORS:
         raise ValueError(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,49 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.kernels import judge, read_actions
 from khop_env.env.layout import Float32Array, ObservationLayout
-from khop_env.env.leaders import LeaderRoutes, require_same_leaders
+from khop_env.env.leaders import LeaderRoutes
 from khop_env.env.settings import Settings
+from khop_env.env.state import INFO_KEYS, EnvState, Infos, Step
 from khop_env.env.tasks import Task
 from khop_env.observers import FloatArray, IntArray
-from khop_env.simulation import Simulator, SimulatorState
-
-INFO_KEYS = (
-    "task_error",
-    "max_normalized_disagreement",
-    "max_error_to_bound",
-    "clipped_observations",
-    "clipped_actions",
-)
-"""Keys of every info: the agent's root mean square error along its task edges in m; the largest |xi| / rho and
-|x_tilde| / delta (inputs: |mu| / omega, |g_tilde| / theta) of all observers since the last action, below 1 by
-guarantee; entries of this agent's observation and action that were clipped."""
-
-
-Infos = dict[str, NDArray[Any]]
-Step = tuple[Float32Array, FloatArray, NDArray[np.bool_], NDArray[np.bool_], Infos]
-
-
-@dataclass(frozen=True, eq=False)
-class EnvState:
-    """Everything that an environment needs to continue bit for bit; treat it as opaque.
-
-    Attributes:
-        simulator: states, estimates and the disturbances' draws.
-        inputs: (m, B) inputs in force, as fractions of their limits.
-        cycles: (B,) control periods since reset.
-        over: (B,) whether the episode has ended, or none has begun.
-        routes: the leaders' draws.
-        generators: one per copy; None before the first reset.
-        seeded: (B,) whether a copy was ever reset with a seed.
-    """
-
-    simulator: SimulatorState
-    inputs: FloatArray
-    cycles: IntArray
-    over: NDArray[np.bool_]
-    routes: LeaderRoutes | None
-    generators: list[np.random.Generator | None]
-    seeded: NDArray[np.bool_]
+from khop_env.simulation import Simulator
 
 
 class BatchedEnv:
@@ -182,18 +143,27 @@ class BatchedEnv:
         for number in range(self.settings.substeps):
             self._advance(number)
         self._cycles += 1
-        reward, task_error = self._judge()
+        reward, info = self._judge()
         terminated = np.zeros(self.batch, bool)
         if self.settings.success_radius is not None:
-            terminated = task_error.max(axis=1) <= self.settings.success_radius
+            terminated = info[0].max(axis=1) <= self.settings.success_radius
         truncated = (self._cycles >= self.settings.max_cycles) & ~terminated
         self._over = terminated | truncated
-        observations, infos = self._observed(task_error)
+        observations, infos = self._observed(info)
         return observations, reward, terminated, truncated, infos
 
     def observations(self) -> Float32Array:
         """What the agents observe now, in new memory."""
         return self._observe()[0]
+
+    @property
+    def over(self) -> NDArray[np.bool_]:
+        """(B,) whether a copy's episode has ended, or none has begun."""
+        return self._over.copy()
+
+    def task_errors(self) -> FloatArray:
+        """(B, N) each agent's root mean square error along its task edges now, in m."""
+        return self._judge()[1][0]
 
     def state(self) -> Float32Array:
         """(B, S) the true global state, `state_fields` by name, in new memory."""
@@ -207,7 +177,8 @@ class BatchedEnv:
             self._inputs.copy(),
             self._cycles.copy(),
             self._over.copy(),
-            copy.deepcopy(self._routes),
+            tuple(self.fleet.ids[i] for i in self.task.leaders),
+            () if self._routes is None else (self._routes.drawn.copy(), self._routes.start.copy()),
             copy.deepcopy(self._generators),
             self._seeded.copy(),
         )
@@ -218,11 +189,18 @@ class BatchedEnv:
         Raises:
             ValueError: if it is of an environment of other dimensions or leaders; nothing has changed then.
         """
-        require_same_leaders(self._routes, state.routes)
+        leaders = tuple(self.fleet.ids[i] for i in self.task.leaders)
+        if leaders != state.leaders:
+            raise ValueError(
+                f"can't restore: the state is of an environment led by {', '.join(state.leaders) or 'nobody'}, this "
+                f"one is led by {', '.join(leaders) or 'nobody'}"
+            )
         self.simulator.restore(state.simulator)
         self._inputs[...] = state.inputs
         self._cycles, self._over, self._seeded = state.cycles.copy(), state.over.copy(), state.seeded.copy()
-        self._routes, self._generators = copy.deepcopy(state.routes), copy.deepcopy(state.generators)
+        self._generators = copy.deepcopy(state.generators)
+        if self._routes is not None:
+            self._routes.drawn, self._routes.start = (one.copy() for one in state.routes)
 
     # -- parts ---------------------------------------------------------------------------------------------------
 
@@ -288,7 +266,7 @@ class BatchedEnv:
             shapes.insert(0, (self.batch, len(self.agents), width // len(self.agents)))
         if given.shape not in shapes or given.dtype.kind not in "fiu":
             raise ValueError(f"actions must be numbers of shape {shapes[0]}; got {given.dtype} of shape {given.shape}")
-        flat = np.ascontiguousarray(given.reshape(self.batch, width), np.float32)
+        flat = np.ascontiguousarray(given.reshape(self.batch, width), np.float64)
         clipped = np.zeros_like(self._clipped_actions)
         bad = read_actions(flat, self._action_entry, self._action_column, self._action_owner, self._command, clipped)
         if bad >= 0:
@@ -313,14 +291,17 @@ class BatchedEnv:
         simulator.step(dt, self._physical.T)
 
     def _judge(self) -> tuple[FloatArray, FloatArray]:
-        """Rewards (B, N), and task errors (B, N) in m."""
+        """Rewards (B, N), and the first three infos (3, B, N)."""
         settings = self.settings
-        reward, task_error = np.empty((2, self.batch, len(self.agents)))
+        simulator, shape = self.simulator, (self.batch, len(self.agents))
+        reward, info = np.empty(shape), np.empty((3, *shape))
         scale = settings.control_period, float(settings.effort)
-        judge(*self._edges, self.simulator.x.T, self._input_owner, self._inputs, scale, self._cost, reward, task_error)
+        seen = simulator.extremes
+        ratios = seen.normalized, seen.relative, seen.input_normalized, seen.input_relative
+        judge(*self._edges, simulator.x.T, self._input_owner, self._inputs, scale, ratios, self._cost, reward, info)
         if settings.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
-        return reward, task_error
+        return reward, info
 
     def _observe(self) -> tuple[Float32Array, IntArray]:
         """Observations, and how many entries of each agent's were clipped."""
@@ -333,18 +314,7 @@ class BatchedEnv:
             return flat.reshape(self.batch, len(self.agents), -1), clipped
         return flat, clipped
 
-    def _observed(self, task_error: FloatArray) -> tuple[Float32Array, Infos]:
+    def _observed(self, info: FloatArray) -> tuple[Float32Array, Infos]:
         observations, clipped = self._observe()
-        seen = self.simulator.extremes
-        shape = clipped.shape
-        ratios = (
-            np.maximum(seen.normalized, seen.input_normalized),
-            np.maximum(seen.relative, seen.input_relative),
-        )
-        values = (
-            task_error,
-            *(np.broadcast_to(one[:, None], shape).copy() for one in ratios),
-            clipped,
-            self._clipped_actions.copy(),
-        )
+        values = (*info, clipped, self._clipped_actions.copy())
         return observations, dict(zip(INFO_KEYS, values, strict=True))

@@ -10,10 +10,10 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
-from khop_env.env.batched import INFO_KEYS, Infos
 from khop_env.env.layout import Float32Array
 from khop_env.env.options import initial_states
 from khop_env.env.parallel import RENDER_MODES, KHopEnv
+from khop_env.env.state import INFO_KEYS, Infos
 
 
 class JointEnv(gymnasium.Env[Float32Array, Float32Array]):

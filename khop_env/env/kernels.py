@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from khop_env.compiled import compiled
-from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray, IntArray
 
 
 @compiled
 def read_actions(
-    actions: Float32Array, entry: IntArray, column: IntArray, owner: IntArray, command: FloatArray, clipped: IntArray
+    actions: FloatArray, entry: IntArray, column: IntArray, owner: IntArray, command: FloatArray, clipped: IntArray
 ) -> int:
     """Clip actions to [-1, 1] and write them into `command` (m, B); count what was clipped.
 
@@ -55,11 +54,12 @@ def judge(
     input_owner: IntArray,
     u: FloatArray,
     scale: tuple[float, float],
+    extremes: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     cost: FloatArray,
     reward: FloatArray,
-    task_error: FloatArray,
+    info: FloatArray,
 ) -> None:
-    """Write every agent's reward and its root mean square error along its task edges.
+    """Write every agent's reward, its root mean square error along its task edges, and the observers' extremes.
 
     Args:
         agent: (E,) number of the agent that an edge belongs to.
@@ -71,9 +71,11 @@ def judge(
         input_owner: (m,) number of the agent whose input it is, -1 for leaders.
         u: (m, B) inputs as fractions of their limits.
         scale: control period in s, and the weight of the squared inputs in m^2.
+        extremes: (B,) each: largest |xi| / rho, |x_tilde| / delta, |mu| / omega, |g_tilde| / theta.
         cost: (2, N, B) scratch.
         reward: (B, N) overwritten with -period * (mean square error + weight * |u|^2).
-        task_error: (B, N) overwritten, in m.
+        info: (3, B, N) overwritten with the task error in m, the largest disagreement and the largest error, each as a
+            fraction of its bound.
     """
     cost[:] = 0.0
     for edge in range(agent.size):
@@ -88,4 +90,6 @@ def judge(
     for env in range(reward.shape[0]):
         for i in range(reward.shape[1]):
             reward[env, i] = -scale[0] * (cost[0, i, env] + scale[1] * cost[1, i, env])
-            task_error[env, i] = np.sqrt(cost[0, i, env])
+            info[0, env, i] = np.sqrt(cost[0, i, env])
+            info[1, env, i] = max(extremes[0][env], extremes[2][env])
+            info[2, env, i] = max(extremes[1][env], extremes[3][env])

@@ -27,14 +27,12 @@ class LeaderRoutes:
         batch: number of environments B.
 
     Attributes:
-        ids: of the agents that it drives.
         drawn: (B, 2, leaders, d, SINES) frequencies in rad/s and phases of this episode.
         start: (B, leaders, d) where the routes begin, in m.
     """
 
     def __init__(self, fleet: Fleet, task: Task, batch: int) -> None:
         self._fleet, self._leaders = fleet, np.array(task.leaders, np.int64)
-        self.ids = [fleet.ids[i] for i in task.leaders]
         shape = len(self._leaders), fleet.position_dim
         self.drawn = np.ones((batch, 2, *shape, SINES))
         self.start = np.zeros((batch, *shape))
@@ -58,17 +56,3 @@ class LeaderRoutes:
         for number, (i, model) in enumerate(zip(self._leaders, self._models, strict=True)):
             states = x[:, self._fleet.state_slice(i)]
             u[:, self._fleet.input_slice(i)] = velocity_to_input(model, states, velocity[:, number])
-
-
-def require_same_leaders(mine: LeaderRoutes | None, theirs: LeaderRoutes | None) -> None:
-    """Refuse a state of an environment with other leaders.
-
-    Raises:
-        ValueError: naming both.
-    """
-    leaders, others = ([] if routes is None else routes.ids for routes in (mine, theirs))
-    if leaders != others:
-        raise ValueError(
-            f"can't restore: the state is of an environment led by {', '.join(others) or 'nobody'}, this one is led by "
-            f"{', '.join(leaders) or 'nobody'}"
-        )

@@ -10,10 +10,11 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from khop_env.env.batched import INFO_KEYS, BatchedEnv, EnvState, Infos
+from khop_env.env.batched import BatchedEnv
 from khop_env.env.layout import Float32Array, ObservationLayout
 from khop_env.env.options import initial_states
-from khop_env.observers import IntArray
+from khop_env.env.state import INFO_KEYS, EnvState, Infos
+from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import did_you_mean
 
 if TYPE_CHECKING:
@@ -70,8 +71,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             agent: Box(-1.0, 1.0, (part.stop - part.start,), np.float32) for agent, part in self._entries.items()
         }
         self.state_space = state_space(batched)
-        self._actions = np.zeros((1, int(batched.action_offset[-1])), np.float32)
-        self._task_error: float | None = None  # mean over agents, for the picture; None before the first reset
+        self._actions = np.zeros((1, int(batched.action_offset[-1])))
+        self._begun = False
         self._renderer: Renderer | None = None
 
     def __repr__(self) -> str:
@@ -110,7 +111,6 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             DesignError: for initial states that the observers can't start from.
         """
         observations, infos = self.batched.reset(seed, initial_states=initial_states(self.batched.fleet, options))
-        self.agents = list(self.possible_agents)
         return self._by_agent(observations), self.shown(infos)
 
     def step(self, actions: Mapping[str, Float32Array]) -> ParallelStep:
@@ -126,8 +126,6 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         observations, reward, terminated, truncated, infos = self.batched.step(self._flat(actions))
         over = bool(terminated[0]), bool(truncated[0])
         agents = self.possible_agents
-        if any(over):
-            self.agents = []
         return (
             self._by_agent(observations),
             dict(zip(agents, reward[0].tolist(), strict=True)),
@@ -151,6 +149,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
     def set_state(self, state: EnvState) -> None:
         """Continue from `get_state()`'s result, bit for bit."""
         self.batched.set_state(state)
+        self._begun = self._begun or not state.over[0]
         self.agents = [] if state.over[0] else list(self.possible_agents)
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -178,7 +177,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             raise ValueError(f"no agent {agent!r}; {why}")
         return agent
 
-    def _flat(self, actions: Mapping[str, Float32Array]) -> Float32Array:
+    def _flat(self, actions: Mapping[str, Float32Array]) -> FloatArray:
         if not self.agents:
             raise ValueError("no episode is running: it is over, or none has begun; call reset() first")
         flat = self._actions[0]
@@ -187,7 +186,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
                 missing = [one for one in self.agents if one not in actions]
                 raise ValueError(f"actions are missing for {len(missing)} agents: {', '.join(missing[:8])}")
             try:
-                given = np.asarray(actions[agent], dtype=np.float32)
+                given = np.asarray(actions[agent], dtype=np.float64)
             except (TypeError, ValueError):
                 raise ValueError(f"the action of {agent!r} isn't numbers: {actions[agent]!r}") from None
             if given.shape != (part.stop - part.start,):
@@ -205,15 +204,16 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         return {agent: flat[part] for agent, part in self._columns.items()}
 
     def shown(self, infos: Infos) -> dict[str, dict[str, float]]:
-        """Infos by agent, after the window has been brought up to date in mode "human"."""
-        self._task_error = float(infos["task_error"].mean())
+        """Infos by agent, after `agents` and the window have been brought up to date with `batched`."""
+        self._begun = True
+        self.agents = [] if self.batched.over[0] else list(self.possible_agents)
         if self.render_mode == "human":
             self._draw()
         rows = zip(*(infos[key][0].tolist() for key in INFO_KEYS), strict=True)
         return {agent: dict(zip(INFO_KEYS, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
 
     def _draw(self) -> NDArray[np.uint8] | None:
-        if self._task_error is None:
+        if not self._begun:
             raise ValueError("there is nothing to render yet: call reset() first")
         simulator, task = self.batched.simulator, self.batched.task
         if self._renderer is None:
@@ -222,7 +222,14 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             self._renderer = Renderer(simulator.design, task.edges, leaders=task.leaders, title=str(self))
         seen = simulator.extremes
         normalized = max(float(seen.normalized[0]), float(seen.input_normalized[0]))
-        scene = float(simulator.t[0]), simulator.x[0], simulator.estimates[0], normalized, self._task_error
+        task_error = float(self.batched.task_errors().mean())
+        scene = (
+            float(simulator.t[0]),
+            simulator.x[0],
+            simulator.estimates[0],
+            normalized,
+            task_error,
+        )
         if self.render_mode == "rgb_array":
             return self._renderer.frame(*scene)
         self._renderer.show(*scene)

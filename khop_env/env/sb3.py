@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from khop_env.env.batched import BatchedEnv
 from khop_env.env.layout import Float32Array
+from khop_env.env.options import initial_states
 from khop_env.env.vector import require_uniform, single_spaces
 
 
@@ -38,8 +39,13 @@ class KHopSB3VecEnv(VecEnv):
         super().__init__(batched.batch * len(batched.agents), *single_spaces(batched))
 
     def reset(self) -> Float32Array:
-        """Start new episodes in all copies; from the seed given to `seed`, copy b from seed + b."""
-        observations, _ = self.batched.reset(self._seeds[0])
+        """Start new episodes in all copies; from the seed given to `seed`, copy b from seed + b.
+
+        Options given to `set_options` are those of the ParallelEnv; they hold for all copies.
+        """
+        observations, _ = self.batched.reset(
+            self._seeds[0], initial_states=initial_states(self.batched.fleet, self._options[0])
+        )
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
+
+import numpy as np
 
 from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
 from khop_env.physics import did_you_mean
 from khop_env.simulation import OBSERVE, Observe
 
 Reward = Literal["agent", "team"]
+NUMBER = (int, float, np.integer, np.floating)
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,8 @@ class Settings:
         max_cycles: control periods after which an episode is truncated.
         control_period: time between actions in s.
         dt: the simulator's step in s; the control period by default.
-        order: of the simulator's step, 1 or 2; the scenario's by default.
+        order: of the simulator's step, 1 or 2. Actions are held over a control period, so that the closed loop is of
+            order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time.
         actuator: "direct", "lag", "slew", "hold", or an `Actuator`.
         reward: "agent" for each agent's own, "team" for the mean of all.
         effort: weight of the squared input (fractions of its limits), in m^2.
@@ -45,7 +49,7 @@ class Settings:
     max_cycles: int = 200
     control_period: float = 0.05
     dt: float | None = None
-    order: int | None = None
+    order: int = 1
     actuator: str | Actuator = "direct"
     reward: Reward = "agent"
     effort: float = 0.1
@@ -64,13 +68,17 @@ class Settings:
         for name in ("bounds", "uniform"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False; got {getattr(self, name)!r}")
-        if isinstance(self.max_cycles, bool) or not isinstance(self.max_cycles, int) or self.max_cycles < 1:
-            raise ValueError(f"max_cycles must be a positive integer; got {self.max_cycles!r}")
+        for name in ("max_cycles", "order", "threads"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ValueError(f"{name} must be a positive integer; got {value!r}")
         for name in ("control_period", "dt", "success_radius", "limit"):
             value = getattr(self, name)
-            if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f"{name} must be positive and finite; got {value!r}")
-        if not 0.0 <= self.effort < math.inf:
+            if value is None and name in ("dt", "success_radius"):
+                continue
+            if not isinstance(value, NUMBER) or not 0.0 < value < math.inf:
+                raise ValueError(f"{name} must be a positive, finite number; got {value!r}")
+        if not isinstance(self.effort, NUMBER) or not 0.0 <= self.effort < math.inf:
             raise ValueError(f"effort must be finite and not negative; got {self.effort!r}")
         object.__setattr__(self, "actuator", as_actuator(self.actuator))
         substeps = self.substeps  # refuses a period that isn't a whole number of steps
@@ -81,8 +89,12 @@ class Settings:
             )
 
     @classmethod
-    def of(cls, arguments: Mapping[str, Any]) -> Settings:
+    def of(cls, arguments: Mapping[str, Any], others: Sequence[str] = ()) -> Settings:
         """Settings from keyword arguments.
+
+        Args:
+            arguments: by name.
+            others: arguments that the caller knows beside these, for the error.
 
         Raises:
             TypeError: for a name that there isn't, naming the nearest.
@@ -90,7 +102,7 @@ class Settings:
         known = [one.name for one in dataclasses.fields(cls)]
         for name in arguments:
             if name not in known:
-                raise TypeError(f"no argument {name!r}; {did_you_mean(name, known)}")
+                raise TypeError(f"no argument {name!r}; {did_you_mean(name, [*others, *known])}")
         return cls(**arguments)
 
     @property

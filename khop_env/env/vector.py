@@ -11,9 +11,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from khop_env.env.batched import BatchedEnv, Infos
+from khop_env.env.batched import BatchedEnv
 from khop_env.env.layout import Float32Array
 from khop_env.env.options import initial_states
+from khop_env.env.state import Infos
 from khop_env.observers import FloatArray
 
 VectorStep = tuple[Float32Array, FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -172,7 +173,8 @@ class Simulator:
             environments: (R,) which; all B if left out.
 
         Raises:
-            ValueError: for x0 of a wrong shape or not finite, not R seeds, or `environments` that aren't different ones.
+            ValueError: for x0 of a wrong shape or not finite, not R seeds, or `environments` that aren't
+                different ones.
             DesignError: for an x0 that the observers can't start from; nothing has been reset then.
         """
         which = self.chosen(environments)
@@ -212,7 +214,7 @@ class Simulator:
             FunnelError: if an explicit step leaves the funnel; the state is the last one inside.
             SolveError: if a right-hand side gives numbers that aren't finite.
         """
-        if not dt > 0.0 or not np.isfinite(dt):
+        if not 0.0 < dt < math.inf:
             raise ValueError(f"dt must be positive and finite; got {dt!r}")
         if u is not None:
             self._hold(u)
@@ -272,11 +274,11 @@ class Simulator:
         given = np.asarray(u, dtype=float)
         if given.shape not in ((self.fleet.m,), (self.batch, self.fleet.m)):
             raise ValueError(f"u must have shape ({self.fleet.m},) or {(self.batch, self.fleet.m)}; got {given.shape}")
-        bad = np.flatnonzero(~np.isfinite(given.reshape(-1, self.fleet.m)).all(axis=0))
-        if bad.size:
+        if not np.isfinite(given).all():
+            bad = np.flatnonzero(~np.isfinite(given.reshape(-1, self.fleet.m)).all(axis=0))
             agent, name, unit = self.fleet.input_names()[bad[0]]
             raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
-        self._state.u[...] = np.broadcast_to(given, (self.batch, self.fleet.m)).T
+        self._state.u.T[...] = given
         self.integrator.start(self._state)
 
     def _disagreement(self, funnels: Funnels, estimate: FloatArray, source: FloatArray) -> FloatArray:

@@ -1,0 +1,160 @@
+"""How fast the environments step: where the time goes, and against bare particle worlds, taking turns with them."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from khop_env import consensus_v0
+from khop_env.env import BatchedEnv
+
+BATCH = 1024
+PEERS = Path(__file__).parent / "peers"
+TURNS = 5  # the two sides of a ratio take turns, so that the machine's mood meets both
+Rate = Callable[[float], float]
+"""Agent-steps per second, measured for about so many seconds."""
+
+
+def single_rate(seconds: float, order: int = 1) -> float:
+    """Agent-steps per second of one `consensus_v0.parallel_env` on `paper`, random actions, episodes of 200 steps."""
+    env = consensus_v0.parallel_env(order=order)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    pool = [{agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.possible_agents} for _ in range(64)]
+
+    def step(number: int) -> None:
+        env.step(pool[number % len(pool)])
+        if not env.agents:
+            env.reset()
+
+    return len(env.possible_agents) * _calls_per_second(step, seconds)
+
+
+def batched(scenario: str, order: int, threads: int, batch: int = BATCH) -> tuple[BatchedEnv, Callable[[int], None]]:
+    """A batched environment and a step with random actions that resets what has ended."""
+    env = consensus_v0.batched_env(scenario, num_envs=batch, order=order, threads=threads)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    shape = batch, len(env.agents), 2
+    pool = [rng.uniform(-1, 1, shape).astype(np.float32) for _ in range(16)]
+
+    def step(number: int) -> None:
+        _, _, terminated, truncated, _ = env.step(pool[number % len(pool)])
+        if (terminated | truncated).any():
+            env.reset(copies=np.flatnonzero(terminated | truncated))
+
+    return env, step
+
+
+def vector_rate(seconds: float, scenario: str, order: int, threads: int, batch: int = BATCH) -> float:
+    """Agent-steps per second of a batch of `consensus_v0`, resets and observations included."""
+    env, step = batched(scenario, order, threads, batch)
+    return batch * len(env.agents) * _calls_per_second(step, seconds)
+
+
+def shares(scenario: str, order: int, batch: int, steps: int) -> dict[str, float]:
+    """Microseconds per copy and step spent in each part of `BatchedEnv.step`, random actions."""
+    env, step = batched(scenario, order, 1, batch)
+    for number in range(5):
+        step(number)
+    simulator: Any = env.simulator
+    integrator, loop = simulator.integrator, simulator.integrator._loop
+    spent: dict[str, float] = {}
+    for name, holder, attributes in (
+        ("solve", integrator, ("_solve_states", "_solve_inputs")),
+        ("right-hand sides", loop, ("plant", "belief", "actuate")),
+        ("observation", env, ("_read_observations",)),
+    ):
+        for attribute in attributes:
+            setattr(holder, attribute, _timed(getattr(holder, attribute), name, spent))
+    start = time.perf_counter()
+    for number in range(steps):
+        step(number)
+    total = time.perf_counter() - start
+    spent["rest, Python and NumPy"] = total - sum(spent.values())
+    return {name: seconds / (steps * batch) * 1e6 for name, seconds in spent.items()}
+
+
+def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str], None], peers: Path | None) -> None:
+    """Print rates and shares; and ratios to the peers installed in the environments under `peers`.
+
+    Args:
+        add: takes a row's name, value, unit and target.
+        quick: as `benchmark`.
+        say: told what is going on.
+        peers: folder with one virtual environment per peer, named mpe2, vmas, jaxmarl; None to leave them out.
+    """
+    seconds, batch = (0.05, 64) if quick else (1.0, BATCH)
+    say(f"environments: where a step of {batch} copies spends its time")
+    for scenario in ("paper", "convoy"):
+        for name, value in shares(scenario, 1, batch, 3 if quick else 60).items():
+            add(f"{scenario}: {name}", value, "us per copy and step")
+
+    def ours(scenario: str, order: int, threads: int) -> Rate:
+        return lambda s: vector_rate(s, scenario, order, threads, batch)
+
+    several = f"VMAS simple_spread, batch {batch}"
+    plan: list[tuple[str, str, Rate, str, int, int, str]] = [
+        (f"single_order{order}", "MPE2 simple_spread", _single(order), "mpe2", 1, 1, "at least 8" if order == 1 else "")
+        for order in (1, 2)
+    ]
+    for scenario in ("paper", "convoy"):
+        for order in (1, 2):
+            wanted = "at least 2" if order == 1 else ""
+            plan.append(
+                (f"vector_{scenario}_order{order}", several, ours(scenario, order, 1), "vmas", batch, 1, wanted)
+            )
+        plan.append((f"vector_{scenario}_threads2", several, ours(scenario, 1, 2), "vmas", batch, 2, ""))
+        name = f"JaxMARL simple_spread, batch {batch}, a step a call"
+        plan.append((f"vector_{scenario}_jax", name, ours(scenario, 1, 1), "jaxmarl", batch, 1, "aim 1"))
+    for name, peer_name, rate, peer, size, threads, target in plan:
+        say(f"environments: {name}")
+        python = None if peers is None else peers / peer / "bin" / "python"
+        if python is None or not python.exists():
+            add(name, rate(seconds), "agent-steps/s")
+            continue
+        mine, theirs = [], []
+        for _ in range(1 if quick else TURNS):
+            mine.append(rate(seconds))
+            theirs.append(_peer_rate(python, peer, size, threads, seconds))
+        add(name, statistics.median(mine), "agent-steps/s")
+        add(f"{name}_ratio", statistics.median(mine) / statistics.median(theirs), f"x {peer_name}", target)
+
+
+def _single(order: int) -> Rate:
+    return lambda seconds: single_rate(seconds, order)
+
+
+def _peer_rate(python: Path, peer: str, batch: int, threads: int, seconds: float) -> float:
+    command = [str(python), str(PEERS / f"{peer}_rate.py"), str(batch), str(threads), str(seconds)]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return float(json.loads(done.stdout.splitlines()[-1])["agent_steps_per_s"])
+
+
+def _timed(function: Callable[..., Any], name: str, spent: dict[str, float]) -> Callable[..., Any]:
+    def call(*arguments: Any) -> Any:
+        start = time.perf_counter()
+        result = function(*arguments)
+        spent[name] = spent.get(name, 0.0) + time.perf_counter() - start
+        return result
+
+    return call
+
+
+def _calls_per_second(step: Callable[[int], None], seconds: float) -> float:
+    for number in range(3):
+        step(number)
+    number, start = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - start) < seconds or number == 0:
+        step(number)
+        number += 1
+    return number / elapsed

@@ -1,0 +1,151 @@
+"""An agent's observation depends on itself, on whom it hears, and on its own estimates, and on nothing else."""
+
+import numpy as np
+import pytest
+from playing import EVERY, parallel, play
+
+every = pytest.mark.parametrize(("environment", "name"), EVERY)
+uniform_or_ragged = pytest.mark.parametrize("uniform", [True, False])
+
+
+def in_mid_episode(environment, name, **arguments):
+    """An environment some steps into an episode, and its fleet's names."""
+    env = parallel(environment, name, bounds=True, **arguments)
+    env.reset(seed=5)
+    play(env, 4)
+    return env, env.batched.fleet.ids
+
+
+def hears(env, i):
+    """The agents within one hop of i, itself included, from the graph alone."""
+    return {i, *env.batched.simulator.design.communication[i]}
+
+
+def observations(env):
+    """Of all agents, by their index in the fleet."""
+    fleet = env.batched.fleet
+    return {fleet.agent(agent): env.observe(agent) for agent in env.possible_agents}
+
+
+def changed(env, saved, write):
+    """The agents whose observation changes when `write` has edited the simulator's saved state."""
+    before = observations(env)
+    edited = env.get_state()
+    write(edited.simulator)
+    env.set_state(edited)
+    after = observations(env)
+    env.set_state(saved)
+    return {i for i in before if before[i].tobytes() != after[i].tobytes()}
+
+
+def moved(part):
+    """Write other states, far from the estimates of them."""
+
+    def write(simulator):
+        simulator.x[part] += 0.7 + 0.1 * np.arange(simulator.x[part].shape[0])[:, None]
+
+    return write
+
+
+@uniform_or_ragged
+@pytest.mark.parametrize("observe", ["estimate", "local"])
+@every
+def test_the_true_state_of_an_unheard_agent_changes_nothing(environment, name, observe, uniform):
+    """For every pair, leaders included: i's observation changes with j's state exactly if i hears j, or is j."""
+    env, ids = in_mid_episode(environment, name, observe=observe, uniform=uniform)
+    saved = env.get_state()
+    acting = {env.batched.fleet.agent(agent) for agent in env.possible_agents}
+    pairs = 0
+    for j in range(len(ids)):
+        seen_by = changed(env, saved, moved(env.batched.fleet.state_slice(j)))
+        assert seen_by == {i for i in acting if j in hears(env, i)}, ids[j]
+        pairs += len(acting) - len(seen_by)
+    assert pairs > 0
+
+
+@uniform_or_ragged
+@every
+def test_the_oracle_sees_exactly_those_within_k_hops(environment, name, uniform):
+    """The same edit shows in every observation within k hops: the test above could fail."""
+    import networkx as nx
+
+    env, ids = in_mid_episode(environment, name, observe="oracle", uniform=uniform)
+    saved, design = env.get_state(), env.batched.simulator.design
+    hops = dict(nx.all_pairs_shortest_path_length(design.communication))
+    acting = {env.batched.fleet.agent(agent) for agent in env.possible_agents}
+    for j in range(len(ids)):
+        seen_by = changed(env, saved, moved(env.batched.fleet.state_slice(j)))
+        assert seen_by == {i for i in acting if hops[i][j] <= design.k}, ids[j]
+
+
+@every
+def test_estimates_are_seen_by_those_who_make_them_only(environment, name):
+    """Every entry of the estimates belongs to one observer: nobody else's observation changes with it."""
+    env, _ = in_mid_episode(environment, name)
+    saved, layout, fleet = env.get_state(), env.batched.simulator.design.states.layout, env.batched.fleet
+    acting = {fleet.agent(agent) for agent in env.possible_agents}
+    edited = np.zeros(layout.size, bool)
+    for observer in range(len(fleet)):
+        mine = np.zeros(layout.size, bool)
+        for (i, j), slot in layout.slot.items():
+            if i == observer:
+                mine[slot : slot + fleet.models[j].n] = True
+
+        def write(simulator, mine=mine):
+            simulator.estimate[mine] += 0.3
+
+        assert not (edited & mine).any()
+        edited |= mine
+        assert changed(env, saved, write) == ({observer} & acting if mine.any() else set())
+    assert edited.all()
+
+
+@every
+@pytest.mark.parametrize("observe", ["oracle", "local"])
+def test_estimates_show_in_no_other_mode(environment, name, observe):
+    """Neither the truth nor nothing depends on what anybody estimates."""
+    env, _ = in_mid_episode(environment, name, observe=observe)
+
+    def write(simulator):
+        simulator.estimate += 0.3
+
+    assert changed(env, env.get_state(), write) == set()
+
+
+@every
+def test_inputs_draws_and_solver_states_show_to_nobody_else(environment, name):
+    """What others do, the disturbance and the observers' inner states stay hidden; a lagging input is its owner's."""
+    env, ids = in_mid_episode(environment, name, actuator="lag")
+    fleet = env.batched.fleet
+    saved = env.get_state()
+
+    def write(simulator):
+        simulator.drawn += 0.1
+        simulator.u += 0.1
+        simulator.g += 0.1
+        simulator.input_estimate += 0.1
+        simulator.eps += 0.1
+        simulator.nu += 0.1
+
+    assert changed(env, saved, write) == set()
+    acting = {fleet.agent(agent) for agent in env.possible_agents}
+    for j in range(len(ids)):
+        before = observations(env)
+        edited = env.get_state()
+        edited.inputs[fleet.input_slice(j)] *= 0.5
+        env.set_state(edited)
+        after = observations(env)
+        env.set_state(saved)
+        assert {i for i in before if before[i].tobytes() != after[i].tobytes()} == {j} & acting, ids[j]
+
+
+def test_leaders_routes_show_to_nobody():
+    """The plan of a leader is in no observation, before it has moved."""
+    env, _ = in_mid_episode("leader_following_v0", "convoy", observe="oracle")
+    before = observations(env)
+    edited = env.get_state()
+    for routes in edited.routes:
+        routes += 0.5
+    env.set_state(edited)
+    after = observations(env)
+    assert all(before[i].tobytes() == after[i].tobytes() for i in before)
