@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench integrations clean
 
 demo: .venv/core
 	$(BIN)/khop run paper
@@ -19,6 +19,13 @@ lint: .venv/dev
 bench: .venv/bench $(if $(PEERS),.peers/mpe2/done .peers/vmas/done .peers/jaxmarl/done)
 	$(BIN)/khop bench $(if $(PEERS),--peers .peers)
 
+# RLlib, TorchRL and Tianshou with the environments, each library in an environment of its own (minutes)
+integrations: .peers/rllib/done .peers/torchrl/done .peers/tianshou/done
+	for name in rllib torchrl tianshou; do .peers/$$name/bin/python examples/integrations/run_$$name.py || exit 1; done
+
+.peers/rllib/done: PACKAGES = -e '.[ray]' torch
+.peers/torchrl/done: PACKAGES = -e . 'torchrl>=0.7'
+.peers/tianshou/done: PACKAGES = -e . 'tianshou>=2.0'
 .peers/mpe2/done: PACKAGES = mpe2 pygame-ce
 .peers/vmas/done: PACKAGES = vmas torch
 .peers/jaxmarl/done: PACKAGES = jaxmarl jax
