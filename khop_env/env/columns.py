@@ -204,4 +204,4 @@ def _flag(name: str, value: bool) -> Column:
 
 
 def _zero(name: str) -> Column:
-    return Column(Field(name, "", 0.0, 0.0))
+    return Column(Field(name, "", 0.0, 1.0))  # always 0, but Gymnasium warns of spaces without width
