@@ -98,12 +98,12 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command("list")
 def list_scenarios(as_json: JsonOption = False) -> None:
-    """List the scenarios, with one line each."""
-    from khop_env.registry import describe
+    """List the scenarios, with one line each, and the environments, which run on all of them."""
+    from khop_env.registry import describe, environments
 
     found = describe()
     if as_json:
-        _print_json({"scenarios": found})
+        _print_json({"scenarios": found, "environments": environments()})
         return
     print_table(
         ("scenario", "parameters", "what it is"),
@@ -112,6 +112,7 @@ def list_scenarios(as_json: JsonOption = False) -> None:
             for one in found
         ],
     )
+    typer.echo(f"environments: {', '.join(environments())}")
 
 
 @app.command()

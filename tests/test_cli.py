@@ -48,12 +48,13 @@ def folder(tmp_path, monkeypatch):
 class TestList:
     def test_table(self):
         found = khop("list").stdout
-        for name in ("paper", "mixed_fleet", "random_geometric", "agents=100"):
+        for name in ("paper", "mixed_fleet", "random_geometric", "agents=100", "leader_following_v0"):
             assert name in found
 
     def test_json(self):
-        found = only_json(khop("list", "--json"))["scenarios"]
-        assert [one["name"] for one in found] == ["paper", "convoy", "mixed_fleet", "random_geometric"]
+        found = only_json(khop("list", "--json"))
+        assert [one["name"] for one in found["scenarios"]] == ["paper", "convoy", "mixed_fleet", "random_geometric"]
+        assert found["environments"] == ["consensus_v0", "formation_v0", "leader_following_v0"]
 
 
 class TestCheck:
