@@ -307,7 +307,7 @@ class TestExport:
 class TestBench:
     @pytest.fixture(autouse=True)
     def stand_in(self, monkeypatch):
-        def benchmark(quick=False, progress=None):
+        def benchmark(quick=False, progress=None, peers=None):
             progress("measuring")
             rows = [{"name": "speedup", "value": 61.234567, "unit": "x", "target": ">= 60"}]
             return {"rows": rows, "machine": "here", "quick": quick}

@@ -23,6 +23,7 @@ RANKS = [
     ["agents"],
     ["khop_env.bench"],
     ["khop_env.terminal"],
+    ["khop_env.commands"],
     ["khop_env.cli", "khop_env.__main__"],
 ]
 # Where a third-party package may be imported at all (architecture, last paragraph of the import order).

@@ -1,0 +1,1 @@
+"""What each `khop` command does; `khop_env.cli` puts them together."""

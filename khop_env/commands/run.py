@@ -1,0 +1,161 @@
+"""`khop run`: simulate a scenario's closed loop, and write down what happened."""
+
+from __future__ import annotations
+
+import enum
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from khop_env.commands.common import JsonOption, ObserveOption, ScenarioArgument, load, mistakes, print_json
+from khop_env.terminal import Progress, say, waiting
+
+if TYPE_CHECKING:
+    from khop_env.results import Recording
+    from khop_env.scenarios import LawChoice, Scenario
+
+EXPLICIT_STEP = 1e-5  # s: how the paper samples its example
+
+
+class IntegratorOption(enum.StrEnum):
+    """How the observers are integrated."""
+
+    PROXIMAL = "proximal"
+    EXPLICIT = "explicit"
+
+
+class OrderOption(enum.StrEnum):
+    """Order of the proximal integrator."""
+
+    ONE = "1"
+    TWO = "2"
+
+
+def run(
+    name: ScenarioArgument,
+    controller: Annotated[str | None, typer.Option(help="Feedback law; by default the scenario's.")] = None,
+    observe: Annotated[
+        ObserveOption, typer.Option(help="What the law sees of agents out of earshot.")
+    ] = ObserveOption.ESTIMATE,
+    duration: Annotated[float | None, typer.Option(help="Seconds; by default the scenario's.")] = None,
+    dt: Annotated[
+        float | None,
+        typer.Option(help=f"Step in seconds; by default the scenario's, or {EXPLICIT_STEP:g} for explicit."),
+    ] = None,
+    integrator: Annotated[IntegratorOption, typer.Option(help="Integrator.")] = IntegratorOption.PROXIMAL,
+    order: Annotated[OrderOption | None, typer.Option(help="Of the proximal integrator; the scenario's.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the initial state and the disturbance.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; by default runs/SCENARIO.")] = None,
+    video: Annotated[Path | None, typer.Option(help="Film the run, too: a file ending in .mp4 or .gif.")] = None,
+    observer: Annotated[
+        str | None,
+        typer.Option(help="Agent whose beliefs the film shows, by id or number; by default the one that needs most."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Simulate the closed loop; write its tables, its summary and the paper's figure.
+
+    Exits with 1 if a funnel was left. Whatever was computed until then is written all the same.
+    """
+    from agents import make_law
+    from khop_env.results import RunFileError, record, summarize, write_run
+    from khop_env.simulation import Explicit, Proximal
+
+    explicit = integrator is IntegratorOption.EXPLICIT
+    with mistakes(name), waiting(f"designing the observers of {name}"):
+        scenario = load(name)
+        law = _law(scenario, controller)
+        if explicit and order is OrderOption.TWO:
+            raise ValueError("--order 2: the explicit integrator is forward Euler, of order 1; leave --order out")
+        stepper = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
+        dt = dt if dt is not None else EXPLICIT_STEP if explicit else scenario.dt
+        duration = scenario.duration if duration is None else duration
+        for option, value in (("--duration", duration), ("--dt", dt)):
+            if not 0.0 < value < float("inf"):
+                raise ValueError(f"{option} must be positive and finite; got {value!r}")
+        simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
+        simulator.reset(seed)
+        shown = _film(video, observer, scenario)
+        folder = out or Path("runs") / _folder_name(scenario.name)
+        folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost
+    with Progress(f"simulating {scenario.name}") as progress:
+        recording = record(simulator, duration, dt, progress=progress)
+    summary = summarize(
+        recording,
+        scenario,
+        seed=seed,
+        dt=dt,
+        integrator=stepper,
+        controller=law.name,
+        observe=observe.value,
+    )
+    unwritten: RunFileError | None = None
+    with mistakes(), waiting(f"writing {folder}"):
+        try:
+            files = write_run(recording, scenario, summary, folder)
+        except RunFileError as error:
+            files, unwritten = error.written, error
+    unfilmed = None if video is None else _write_video(recording, scenario, video, shown, files)
+    if as_json:
+        print_json({**summary, "files": {key: str(path) for key, path in files.items()}})
+    else:
+        from khop_env.terminal import print_summary
+
+        print_summary(summary, files)
+        if "video" in files:
+            typer.echo(f"video: {files['video']}")
+    if recording.error is not None:
+        say(f"khop: {recording.error}")
+    if failures := [failure for failure in (unwritten, unfilmed) if failure is not None]:
+        for failure in failures:
+            say(f"khop: {failure}")
+        raise typer.Exit(2)
+    if not summary["funnel_kept"]:
+        raise typer.Exit(1)
+
+
+def _folder_name(scenario_name: str) -> str:
+    """A scenario's name as that of one visible folder."""
+    return re.sub(r"[^\w.-]+", "_", scenario_name).lstrip(".") or "scenario"
+
+
+def _law(scenario: Scenario, controller: str | None) -> LawChoice:
+    from khop_env.scenarios import LawChoice
+
+    return scenario.law if controller in (None, scenario.law.name) else LawChoice(str(controller))
+
+
+def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int | None:
+    """Refuse a film that couldn't be made before there is something to lose; the number of the agent to show, if any.
+
+    Raises:
+        ValueError: for a file or an agent that won't do.
+        ModuleNotFoundError: if a package is missing.
+        OSError: if its folder can't be made.
+    """
+    if video is None:
+        if observer is not None:
+            raise ValueError("--observer chooses whose beliefs a film shows; give --video FILE, too")
+        return None
+    from khop_env.results.video import require_video
+
+    require_video(video)
+    shown = None if observer is None else scenario.fleet.agent(int(observer) if observer.isdecimal() else observer)
+    video.parent.mkdir(parents=True, exist_ok=True)
+    return shown
+
+
+def _write_video(
+    recording: Recording, scenario: Scenario, path: Path, observer: int | None, files: dict[str, Path]
+) -> str | None:
+    """Write the film and add it to `files`; or what went wrong, which must not cost the run its other results."""
+    from khop_env.results.video import write_video
+
+    try:
+        with Progress(f"filming {scenario.name}") as progress:
+            files["video"] = write_video(recording, scenario, path, observer=observer, progress=progress)
+    except Exception as error:
+        return f"couldn't write {path} ({str(error) or type(error).__name__})"
+    return None
