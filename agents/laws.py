@@ -6,13 +6,20 @@ import inspect
 from collections.abc import Callable
 from typing import get_type_hints
 
-from agents.consensus import TanhConsensus
+from agents.consensus import LinearConsensus, TanhConsensus
+from agents.formation import FormationLaw
+from agents.leader_following import LeaderFollowingLaw
 from khop_env.physics import did_you_mean
 from khop_env.scenarios import LawChoice
 from khop_env.scenarios.checked import describe, fits
 from khop_env.simulation import Law
 
-LAWS: dict[str, Callable[..., Law]] = {"tanh": TanhConsensus}
+LAWS: dict[str, Callable[..., Law]] = {
+    "tanh": TanhConsensus,
+    "linear": LinearConsensus,
+    "formation": FormationLaw,
+    "leader_following": LeaderFollowingLaw,
+}
 
 
 class LawError(ValueError):

@@ -15,6 +15,8 @@ import typer
 
 from khop_env import __version__
 from khop_env.commands.bench import bench
+from khop_env.commands.evaluate import evaluate
+from khop_env.commands.iss import iss
 from khop_env.commands.run import run
 from khop_env.commands.scenarios import check, export, list_scenarios
 from khop_env.terminal import say
@@ -33,6 +35,8 @@ app.command("list")(list_scenarios)
 app.command()(check)
 app.command()(run)
 app.command()(export)
+app.command()(evaluate)
+app.command()(iss)
 app.command()(bench)
 
 

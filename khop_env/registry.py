@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, get_type_hints
@@ -58,7 +58,7 @@ def make_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopVecto
     Raises:
         ValueError: for an unknown environment or scenario, naming the nearest, or a wrong argument.
     """
-    return KHopVectorEnv(_module(environment).batched_env(num_envs=num_envs, **arguments), name=environment)
+    return KHopVectorEnv(environment_module(environment).batched_env(num_envs=num_envs, **arguments), name=environment)
 
 
 def make_sb3_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopSB3VecEnv:
@@ -73,7 +73,7 @@ def make_sb3_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopS
         ImportError: without Stable-Baselines3.
         ValueError: as `make_vec`.
     """
-    module = _module(environment)
+    module = environment_module(environment)
     try:
         from khop_env.env.sb3 import KHopSB3VecEnv
     except ImportError as error:
@@ -92,7 +92,7 @@ def make_joint(environment: str, render_mode: str | None = None, **arguments: An
     Raises:
         ValueError: as `make_vec`.
     """
-    return JointEnv(_module(environment).parallel_env(render_mode=render_mode, **arguments))
+    return JointEnv(environment_module(environment).parallel_env(render_mode=render_mode, **arguments))
 
 
 def assemble(
@@ -120,10 +120,15 @@ def assemble(
         raise ValueError(f"num_envs must be a positive integer; got {num_envs!r}")
     chosen = scenario_or_name if isinstance(scenario_or_name, Scenario) else scenario(scenario_or_name)
     simulator = chosen.build(integrator=Proximal(settings.order, settings.threads), batch=int(num_envs))
-    return BatchedEnv(simulator, task(chosen), settings)
+    return BatchedEnv(simulator, task(chosen), settings, chosen.name)
 
 
-def _module(environment: str) -> ModuleType:
+def environment_module(environment: str) -> ModuleType:
+    """The module of an environment, which has `parallel_env`, `batched_env` and `env`.
+
+    Raises:
+        ValueError: for an unknown environment, naming the nearest.
+    """
     if environment not in ENVIRONMENTS:
         raise ValueError(f"no environment {environment!r}; {did_you_mean(environment, ENVIRONMENTS)}")
     return importlib.import_module(f"khop_env.{environment}")
@@ -171,14 +176,7 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
         raise ValueError(f"no scenario {name!r}; {did_you_mean(name, SCENARIOS)} (A file's name ends in .toml.)")
     factory = SCENARIOS[name]
     known = inspect.signature(factory).parameters
-    hints = get_type_hints(factory)
-    for part in filter(None, given.split(",")):
-        key, equals, value = (piece.strip() for piece in part.partition("="))
-        if not equals:
-            raise ValueError(f"scenario {text!r}: expected parameter=value after the colon; got {part!r}")
-        if key in known:  # others are refused below
-            value = _parse(name, key, value, hints.get(key, str))
-        parameters.setdefault(key, value)
+    parameters = parameters_from_text(given, get_type_hints(factory), f"scenario {text!r}") | parameters
     for key in parameters:
         if key not in known:
             what = did_you_mean(key, known) if known else "it has none"
@@ -186,9 +184,26 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
     return factory(**parameters)
 
 
-def _parse(scenario_name: str, key: str, text: str, kind: type) -> Any:
-    try:
-        return _TRUTH[text] if kind is bool else kind(text)
-    except (ValueError, KeyError):
-        expected = "true or false" if kind is bool else f"of type {kind.__name__}"
-        raise ValueError(f"scenario {scenario_name!r}: {key} must be {expected}; got {text!r}") from None
+def parameters_from_text(text: str, types: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """Parameters of "agents=100,k=2": numbers, true or false, or text, as their types ask.
+
+    Args:
+        text: what stands after the colon of a name; may be empty.
+        types: of the known parameters; others stay text, to be refused by name.
+        what: they are parameters of, for the error.
+
+    Raises:
+        ValueError: for what isn't parameter=value, or isn't of its type.
+    """
+    found = {}
+    for part in filter(None, text.split(",")):
+        key, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals:
+            raise ValueError(f"{what}: expected parameter=value after the colon; got {part!r}")
+        kind = types.get(key, str)
+        try:
+            found[key] = _TRUTH[value] if kind is bool else kind(value)
+        except (ValueError, KeyError):
+            expected = "true or false" if kind is bool else f"of type {kind.__name__}"
+            raise ValueError(f"{what}: {key} must be {expected}; got {value!r}") from None
+    return found

@@ -286,15 +286,19 @@ class TestExport:
     @pytest.mark.parametrize(
         ("old", "new", "said"),
         [
-            ('name = "tanh"', 'name = "tan"', "law.name: got 'tan', expected one of 'tanh'; did you mean 'tanh'?"),
+            (
+                'name = "tanh"',
+                'name = "tan"',
+                "law.name: got 'tan', expected one of 'tanh', 'linear', 'formation', 'leader_following'; did you mean 'tanh'?",
+            ),
             (
                 "gain = 2.0",
                 "gian = 2.0",
                 "mine.toml: law.gian: law 'tanh' has no parameter 'gian'; did you mean 'gain'?",
             ),
             ("gain = 2.0", 'gain = "high"', "mine.toml: law.gain: gain of law 'tanh' must be a number; got 'high'"),
-            ("gain = 2.0", "gain = inf", "mine.toml: law: the gain of the tanh law must be positive and finite"),
-            ("gain = 2.0", "gain = -2.0", "mine.toml: law: the gain of the tanh law must be positive"),
+            ("gain = 2.0", "gain = inf", "mine.toml: law: gain must be positive and finite"),
+            ("gain = 2.0", "gain = -2.0", "mine.toml: law: gain must be positive"),
         ],
     )
     def test_a_law_that_is_wrong(self, folder, old, new, said):

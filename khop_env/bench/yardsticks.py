@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.consensus import TanhConsensus, sum_tanh
+from agents.consensus import TanhConsensus
+from agents.velocity_law import sum_edges
 from khop_env.compiled import compiled
 from khop_env.elementary import log_ratio
 from khop_env.observers import FloatArray
@@ -38,7 +39,7 @@ def closed_loop_derivative(
     dx, dy, dghat = dz
     terms, u, e, xi, rho, w = work
     displacements(law[2], law[3], law[4], x, y, terms)
-    sum_tanh(law[0], law[1], terms, u)
+    sum_edges(law[0], True, law[1], terms, u)
     g = u.reshape(x.shape)
     drifting_integrator_drift(x, dx)
     w[:] = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -54,6 +55,11 @@ def in_words_of_the_file(name: str, message: str) -> str:
     for value in ("True", "False"):
         message = message.replace(f"input_observer={value}", f"input_observer = {value.lower()}")
     return f"{name}: {message}"
+
+
+def folder_name(scenario_name: str) -> str:
+    """A scenario's name as that of one visible folder."""
+    return re.sub(r"[^\w.-]+", "_", scenario_name).lstrip(".") or "scenario"
 
 
 def load(name: str) -> Scenario:

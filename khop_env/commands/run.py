@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import enum
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from khop_env.commands.common import JsonOption, ObserveOption, ScenarioArgument, load, mistakes, print_json
+from khop_env.commands.common import (
+    JsonOption,
+    ObserveOption,
+    ScenarioArgument,
+    folder_name,
+    load,
+    mistakes,
+    print_json,
+)
 from khop_env.terminal import Progress, say, waiting
 
 if TYPE_CHECKING:
@@ -78,7 +85,7 @@ def run(
         simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
         simulator.reset(seed)
         shown = _film(video, observer, scenario)
-        folder = out or Path("runs") / _folder_name(scenario.name)
+        folder = out or Path("runs") / folder_name(scenario.name)
         folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost
     with Progress(f"simulating {scenario.name}") as progress:
         recording = record(simulator, duration, dt, progress=progress)
@@ -114,11 +121,6 @@ def run(
         raise typer.Exit(2)
     if not summary["funnel_kept"]:
         raise typer.Exit(1)
-
-
-def _folder_name(scenario_name: str) -> str:
-    """A scenario's name as that of one visible folder."""
-    return re.sub(r"[^\w.-]+", "_", scenario_name).lstrip(".") or "scenario"
 
 
 def _law(scenario: Scenario, controller: str | None) -> LawChoice:

@@ -30,6 +30,7 @@ class BatchedEnv:
         simulator: B copies, without a law.
         task: task edges and leaders.
         settings: everything else.
+        scenario: name of the scenario that it was assembled from.
 
     Attributes:
         agents: ids of the N agents that act.
@@ -43,8 +44,8 @@ class BatchedEnv:
         ValueError: for agents whose inputs have no limit, or a task edge to an agent more than k hops away.
     """
 
-    def __init__(self, simulator: Simulator, task: Task, settings: Settings) -> None:
-        self.simulator, self.task, self.settings = simulator, task, settings
+    def __init__(self, simulator: Simulator, task: Task, settings: Settings, scenario: str = "") -> None:
+        self.simulator, self.task, self.settings, self.scenario = simulator, task, settings, scenario
         self.fleet, self.batch = simulator.fleet, simulator.batch
         self._members = [i for i in range(len(self.fleet)) if i not in task.leaders]
         self.agents = tuple(self.fleet.ids[i] for i in self._members)

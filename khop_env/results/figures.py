@@ -46,7 +46,7 @@ def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, age
 
     shown = _default_agent(recording, scenario) if agent is None else recording.fleet.agent(agent)
     name = recording.fleet.ids[shown]
-    with rc_context(_STYLE), np.errstate(all="ignore"):  # of states that ran away, what is finite is drawn
+    with rc_context(STYLE), np.errstate(all="ignore"):  # of states that ran away, what is finite is drawn
         figure = Figure(figsize=(13.0, 4.4), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         _draw_positions(left, recording)
@@ -57,7 +57,7 @@ def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, age
     return Path(path)
 
 
-_STYLE: Any = {
+STYLE: Any = {
     "font.size": 9.5,
     "axes.titlesize": 10.5,
     "axes.spines.top": False,

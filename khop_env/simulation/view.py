@@ -23,9 +23,11 @@ class View:
     Attributes:
         fleet: the agents' models and offsets.
         x: (B, n) states; agent i's law may read its own slice only.
-        edges: (E, 2) directed task edges: agent i = edges[:, 0] is to act on agent j = edges[:, 1].
+        edges: (E, 2) directed task edges: agent i = edges[:, 0] is to act on agent j = edges[:, 1], which is -1 where
+            j isn't one of the fleet's.
         known: (E,) whether i knows anything of j's state: it hears j, or observes it.
-        displacement: (B, E, d) position of j, as i hears or estimates it, minus i's own, in m; 0 where not known.
+        displacement: (B, E, d) position of j, as i hears or estimates it, minus i's own and minus what the task wants
+            it to be, in m; 0 where not known.
 
     The arrays are overwritten by the next evaluation; a law that keeps one copies it.
     """

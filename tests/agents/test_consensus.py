@@ -79,7 +79,7 @@ def test_an_unknown_model_is_told_where_to_add_a_controller():
 def test_laws_by_name():
     assert make_law("tanh") == TanhConsensus()
     assert make_law(LawChoice("tanh", {"gain": 3.0})) == TanhConsensus(3.0)
-    assert set(LAWS) == {"tanh"}
+    assert set(LAWS) == {"tanh", "linear", "formation", "leader_following"}
     with pytest.raises(ValueError, match="no law 'tan'; did you mean 'tanh'"):
         make_law("tan")
     with pytest.raises(LawError, match=r"no parameter 'gian'; did you mean 'gain'\? \(known: gain\)") as caught:
@@ -93,7 +93,7 @@ def test_laws_by_name():
     for value in (np.inf, np.nan):
         with pytest.raises(ValueError, match="positive and finite"):
             TanhConsensus(value)
-    with pytest.raises(ValueError, match="gain of the tanh law must be positive and finite; got -1"):
+    with pytest.raises(ValueError, match="gain must be positive and finite; got -1"):
         TanhConsensus(-1.0)
 
 

@@ -1,0 +1,213 @@
+"""Playing policies over seeded episodes, and what is measured of each episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.policies import make_policy
+from agents.policy import Policy, batched_of, by_agent, describe
+from khop_env.env import BatchedEnv
+from khop_env.observers import FloatArray
+
+if TYPE_CHECKING:
+    import polars as pl
+
+SETTLED = 0.1  # of the initial task error
+Progress = Callable[[float], None]
+"""Called now and then with the fraction that is done."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """What was measured of E episodes.
+
+    Attributes:
+        seed: (E,) each episode's seed.
+        returns: (E,) mean over the agents of the sum of their rewards.
+        final_task_error: (E,) mean over the agents of their task error at the end, in m.
+        settling_time: (E,) time from which the team's mean task error stays at or below a tenth of the initial one, in
+            s; infinite if it doesn't.
+        effort: (E,) mean over agents and time of the squared actions (fractions of the input limits).
+        max_normalized_disagreement: (E,) largest |xi| / rho of all observers.
+        late_normalized_disagreement: (E,) the same after the first quarter of the episode: without the transient.
+        max_error_to_bound: (E,) largest |error| / bound.
+        task_error: (T + 1, E) mean over the agents, at every control period; constant after an early end.
+        time: (T + 1,) in s.
+    """
+
+    seed: np.ndarray
+    returns: FloatArray
+    final_task_error: FloatArray
+    settling_time: FloatArray
+    effort: FloatArray
+    max_normalized_disagreement: FloatArray
+    late_normalized_disagreement: FloatArray
+    max_error_to_bound: FloatArray
+    task_error: FloatArray
+    time: FloatArray
+
+    @staticmethod
+    def joined(parts: Sequence[Episodes]) -> Episodes:
+        """Several after each other."""
+        values = {
+            one.name: np.concatenate([getattr(part, one.name) for part in parts], axis=-1)
+            for one in fields(Episodes)
+            if one.name != "time"
+        }
+        return Episodes(**values, time=parts[0].time)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """One number per episode, by name."""
+        names = [one.name for one in fields(self) if one.name not in ("task_error", "time", "returns", "seed")]
+        return {"seed": self.seed, "return": self.returns, **{name: getattr(self, name) for name in names}}
+
+
+def evaluate(
+    env: object,
+    policies: Mapping[str, Policy] | Sequence[str],
+    seeds: Sequence[int],
+    *,
+    progress: Progress | None = None,
+) -> pl.DataFrame:
+    """Play every policy over the same episodes.
+
+    Args:
+        env: an environment of khop_env; a batch of B plays B episodes at once. It is reset, and left at an end.
+        policies: by name, or names that `make_policy` knows.
+        seeds: one per episode; episodes of different policies with the same seed have the same initial states,
+            disturbances and leaders, so that differences can be paired.
+        progress: told how far it is.
+
+    Returns:
+        A tidy data frame with one row per policy and episode: environment, scenario, observe, policy, seed, return, and
+        the columns of `Episodes`.
+
+    Raises:
+        ValueError: for an unknown policy, no seed, or actions that the environment refuses.
+    """
+    import polars as pl
+
+    batched = batched_of(env)
+    chosen = policies if isinstance(policies, Mapping) else {spec: make_policy(spec) for spec in policies}
+    description = describe(batched)
+    frames = []
+    for number, (name, policy) in enumerate(chosen.items()):
+        told = None if progress is None else lambda part, n=number: progress((n + part) / len(chosen))
+        episodes = play(batched, policy, seeds, name=name, progress=told)
+        frames.append(
+            pl.DataFrame(
+                {
+                    "environment": description.environment,
+                    "scenario": description.scenario,
+                    "observe": description.observe,
+                    "policy": name,
+                    **episodes.columns(),
+                }
+            )
+        )
+    return pl.concat(frames)
+
+
+def play(
+    env: object, policy: Policy, seeds: Sequence[int], *, name: str = "policy", progress: Progress | None = None
+) -> Episodes:
+    """Play one policy, as many episodes at once as the environment has copies.
+
+    Args:
+        env: an environment of khop_env.
+        policy: who plays.
+        seeds: one per episode.
+        name: of the policy, for errors.
+        progress: told how far it is.
+
+    Raises:
+        ValueError: for no seed, or where policy and environment don't fit.
+    """
+    batched = batched_of(env)
+    if not len(seeds):
+        raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
+    parts = []
+    for first in range(0, len(seeds), batched.batch):
+        mine = [int(seed) for seed in seeds[first : first + batched.batch]]
+        filled = mine + [mine[-1]] * (batched.batch - len(mine))
+        try:
+            parts.append(_play(batched, policy, filled, len(mine)))
+        except ValueError as error:
+            raise ValueError(f"policy {name!r} in {batched.task.name}_v0: {error}") from error
+        if progress is not None:
+            progress(min(1.0, (first + batched.batch) / len(seeds)))
+    return Episodes.joined(parts)
+
+
+def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Episodes:
+    """One batch of episodes, of which the first `count` are kept."""
+    horizon, period = env.settings.max_cycles, env.settings.control_period
+    error, returns, effort = np.zeros((horizon + 1, env.batch)), np.zeros(env.batch), np.zeros(env.batch)
+    worst, late, bound = (np.zeros(env.batch) for _ in range(3))
+    inputs = np.array([env.fleet.models[env.fleet.agent(agent)].m for agent in env.agents])
+    policy.reset(describe(env), seeds)
+    observations, infos = env.reset(seeds)
+    error[0] = infos["task_error"].mean(axis=1)
+    running, length = np.ones(env.batch, bool), np.full(env.batch, horizon)
+    for cycle in range(1, horizon + 1):
+        actions = policy.act(by_agent(env, observations))
+        given = _stacked(env, actions)
+        observations, reward, terminated, truncated, infos = env.step(given)
+        returns += np.where(running, reward.mean(axis=1), 0.0)
+        squared = [
+            np.square(np.clip(actions[agent][:, :m], -1.0, 1.0)).sum(axis=1)
+            for agent, m in zip(env.agents, inputs, strict=True)
+        ]
+        effort += np.where(running, np.mean(squared, axis=0), 0.0)
+        seen = np.where(running, infos["max_normalized_disagreement"].max(axis=1), 0.0)
+        worst = np.maximum(worst, seen)
+        if cycle > horizon // 4:
+            late = np.maximum(late, seen)
+        bound = np.maximum(bound, np.where(running, infos["max_error_to_bound"].max(axis=1), 0.0))
+        error[cycle] = np.where(running, infos["task_error"].mean(axis=1), error[cycle - 1])
+        over = terminated | truncated
+        length[running & over] = cycle
+        running &= ~over
+        if not running.any():
+            error[cycle + 1 :] = error[cycle]
+            break
+        if over.any():  # they can't be left standing; what they do from here on isn't counted
+            observations, _ = env.reset(copies=np.flatnonzero(over))
+    settled = error <= SETTLED * error[0]
+    unsettled = np.where(settled.all(axis=0), 0, horizon + 1 - np.argmin(settled[::-1], axis=0))
+    settling = np.where(unsettled > horizon, np.inf, unsettled * period)
+    whole = {
+        "seed": np.array(seeds),
+        "returns": returns,
+        "final_task_error": error[-1],
+        "settling_time": settling,
+        "effort": effort / length,
+        "max_normalized_disagreement": worst,
+        "late_normalized_disagreement": late,
+        "max_error_to_bound": bound,
+        "task_error": error,
+    }
+    return Episodes(
+        **{key: values[..., :count] for key, values in whole.items()}, time=period * np.arange(horizon + 1.0)
+    )
+
+
+def _stacked(env: BatchedEnv, actions: Mapping[str, Any]) -> np.ndarray:
+    """Actions by agent as the arrays that the environment takes.
+
+    Raises:
+        ValueError: for actions that are missing or misshapen.
+    """
+    sizes = (env.action_offset[1:] - env.action_offset[:-1]).tolist()
+    for agent, size in zip(env.agents, sizes, strict=True):
+        if agent not in actions:
+            raise ValueError(f"no action for {agent!r}; got some for {', '.join(list(actions)[:8]) or 'nobody'}")
+        if np.shape(actions[agent]) != (env.batch, size):
+            raise ValueError(
+                f"actions of {agent!r} must have shape {(env.batch, size)}; got {np.shape(actions[agent])}"
+            )
+    return np.concatenate([actions[agent] for agent in env.agents], axis=1)

@@ -1,0 +1,52 @@
+"""Tracking a leader whose input nobody knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from agents.velocity_law import VelocityLaw, sum_edges
+from khop_env.observers import FloatArray
+from khop_env.simulation import View
+
+
+@dataclass
+class LeaderFollowingLaw(VelocityLaw):
+    """v_i = k (s q_i - p_i), with q_i the mean over task edges of where the leader wants the agent, p_j - d_ij.
+
+    A proportional tracker whose target is shrunk towards the origin by s: followers whose inputs saturate can't catch
+    up with a leader that swings about, and are nearer to it on average if they aim at less. Goal set A: q_i = p_i. With
+    s = 1 and the drift cancelled z_i = p_i - q_i of a single integrator obeys z' = -k z + k d + w - q', so that
+    |z| <= e^(-k t) |z(0)| + |d| + (|w| + |q'|) / k while its input isn't cut off: set-ISS with respect to A with
+    gamma(s) = s for estimation errors d, and with the leader's speed |q'| as one more input that keeps it away from A.
+    With s < 1, saturation, or other models: measured only.
+
+    An agent that knows nothing of its leader keeps near the origin, where initial sets are centred.
+
+    Attributes:
+        gain: k in 1/s, positive and finite.
+        shrink: s, from 0 to 1.
+        cancel_drift: whether agents whose input is a velocity subtract their own f(x).
+    """
+
+    gain: float = 3.0
+    shrink: float = 1.0
+    cancel_drift: bool = True
+
+    def __post_init__(self) -> None:
+        self.require_positive("gain")
+        if not 0.0 <= self.shrink <= 1.0:
+            raise ValueError(f"shrink must be from 0 to 1; got {self.shrink!r}")
+
+    def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
+        """Towards the shrunk target."""
+        agents = len(velocity)
+        edges = np.bincount(view.edges[:, 0], minlength=agents)[:, None, None]
+        known = np.bincount(view.edges[view.known, 0], minlength=agents)[:, None, None]
+        position = view.fleet.positions(view.x).transpose(1, 2, 0)
+        sum_edges(1.0, False, view.edges, displacement, velocity)  # sum over known edges of q - p
+        velocity += known * position
+        velocity *= self.shrink / np.maximum(known, 1)
+        velocity -= position
+        velocity *= self.gain * (edges > 0)

@@ -1,0 +1,136 @@
+"""The set-ISS gain of consensus laws, from V = |e|^2 / 2 with e = Pi x the disagreement of the positions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from numpy.typing import ArrayLike
+
+from agents.velocity_law import VELOCITY_INPUTS
+from khop_env.observers import FloatArray
+from khop_env.scenarios import Scenario
+
+
+@dataclass(frozen=True)
+class ComparisonGain:
+    """What V = |e|^2 / 2 says of x_i' = f(x_i) + k sum_j phi(p_j + d_ij - p_i) + w_i, along a connected task graph.
+
+    d collects the estimation errors along those directed task edges (i, j) whose i doesn't hear j, and phi is the
+    identity or tanh, component by component. Pi annihilates f at the mean, so that e' Pi f <= l |e|^2 for a common f
+    with Lipschitz constant l. Without errors the coupling contributes -k sum over edges of s phi(s) with
+    s = p_j - p_i; all |s| <= sqrt(2) |e|, where s tanh(s) >= s^2 tanh(r) / r for |s| <= r; and the sum of the s^2 is
+    e' L e >= lambda_2 |e|^2. Both phi are 1-Lipschitz, so that by Cauchy and Schwarz the errors add at most
+    k sqrt(D) |d| |e|, if no agent has more than D such edges. Therefore
+
+        |e|' <= -h(|e|) + k sqrt(D) |d| + |Pi w|,   h(b) = k lambda_2 tanh(sqrt(2) b) / sqrt(2) - l b    (tanh)
+                                                    h(b) = (k lambda_2 - l) b                          (linear)
+
+    and where h increases, up to `region`, the loop is set-ISS with respect to A = {e = 0}, with the gain
+    gamma(s) = h^-1(k sqrt(D) s). It is the argument that the paper's simulation section sketches, with its V, made
+    quantitative. It holds as long as no input saturates: always for tanh commands below the limits, and for linear ones
+    while k (sqrt(2) n |e| + sqrt(D) |d|) is below them, with at most n edges per agent.
+
+    Attributes:
+        coupling: k lambda_2 in 1/s.
+        lipschitz: l in 1/s.
+        error_weight: k sqrt(D) in 1/s.
+        bounded: whether phi is tanh.
+        most_pull: sqrt(2) k n in 1/s: the largest commanded speed over |e|.
+        limit: the smallest input limit in m/s.
+    """
+
+    coupling: float
+    lipschitz: float
+    error_weight: float
+    bounded: bool
+    most_pull: float = 0.0
+    limit: float = math.inf
+
+    def region(self, error: float = 0.0) -> float:
+        """The largest |e|, in m, up to which h increases and no input saturates, at errors |d| up to `error` in m."""
+        if self.coupling <= self.lipschitz:
+            return 0.0
+        if self.bounded:
+            if self.lipschitz == 0.0:
+                return math.inf
+            return math.acosh(math.sqrt(self.coupling / self.lipschitz)) / math.sqrt(2.0)
+        return max(0.0, (self.limit - self.error_weight * error) / self.most_pull)
+
+    def decrease(self, distance: ArrayLike) -> FloatArray:
+        """h(|e|) in m/s, at distances in m."""
+        b = np.asarray(distance, dtype=float)
+        pull = np.tanh(math.sqrt(2.0) * b) / math.sqrt(2.0) if self.bounded else b
+        return np.asarray(self.coupling * pull - self.lipschitz * b)
+
+    def step(self, distance: FloatArray, error: FloatArray, dt: float) -> FloatArray:
+        """Where the comparison equation b' = -h(b) + k sqrt(D) |d| goes in `dt` seconds; inf once it leaves the region.
+
+        Args:
+            distance: bounds on |e| now, in m.
+            error: |d| during the step, in m.
+            dt: in s.
+        """
+        after = distance - dt * self.decrease(distance) + dt * self.error_weight * error
+        largest = np.array([self.region(float(one)) for one in error.flat]).reshape(error.shape)
+        return np.where(np.maximum(distance, after) <= largest, after, math.inf)
+
+    def ultimate(self, error: float, disturbance: float = 0.0) -> float:
+        """h^-1(k sqrt(D) |d| + |Pi w|): the distance below which |e| ends, in m.
+
+        Args:
+            error: bound on |d| in m.
+            disturbance: bound on |Pi w| in m/s.
+
+        Returns:
+            inf where they are too large for the argument.
+        """
+        pushed, low, high = self.error_weight * error + disturbance, 0.0, self.region(error)
+        if pushed == 0.0:
+            return 0.0
+        if math.isinf(high):
+            if pushed >= self.coupling / math.sqrt(2.0):
+                return math.inf
+            high = 1.0
+            while self.decrease(high) < pushed:
+                high *= 2.0
+        elif self.decrease(high) <= pushed:
+            return math.inf
+        for _ in range(200):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.decrease(middle) < pushed else (low, middle)
+        return high
+
+
+def consensus_gain(scenario: Scenario, gain: float, *, bounded: bool) -> ComparisonGain | None:
+    """The comparison of a consensus law on a scenario, where one can be derived.
+
+    Args:
+        scenario: fleet and graphs.
+        gain: k of the law, in 1/s.
+        bounded: whether it acts on the tanh of displacements.
+
+    Returns:
+        None if agents differ in their drift, aren't moved by x' = f(x) + u, or aren't connected by the task graph; or
+        if tanh commands could exceed an input limit.
+    """
+    fleet, task, models = scenario.fleet, scenario.task, scenario.fleet.models
+    if any(model.type not in VELOCITY_INPUTS or type(model) is not type(models[0]) for model in models):
+        return None
+    if len(models) < 2 or not nx.is_connected(task):
+        return None
+    degree, limit = max(count for _, count in task.degree), float(fleet.input_limit.min())
+    if bounded and gain * degree > limit:
+        return None
+    connectivity = float(np.linalg.eigvalsh(nx.laplacian_matrix(task, nodelist=range(len(fleet))).toarray())[1])
+    unheard = max(sum(not scenario.communication.has_edge(i, j) for j in task[i]) for i in range(len(fleet)))
+    return ComparisonGain(
+        coupling=gain * connectivity,
+        lipschitz=models[0].drift_lipschitz(),
+        error_weight=gain * math.sqrt(unheard),
+        bounded=bounded,
+        most_pull=math.sqrt(2.0) * gain * degree,
+        limit=limit,
+    )

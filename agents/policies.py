@@ -1,0 +1,35 @@
+"""Policies by name: what the command line and the examples ask for."""
+
+from __future__ import annotations
+
+from typing import get_type_hints
+
+from agents.laws import LAWS
+from agents.policy import Policy
+from agents.scripted import LawPolicy, RandomPolicy, ZeroPolicy
+from khop_env.physics import did_you_mean
+from khop_env.registry import parameters_from_text
+
+POLICIES = (*LAWS, "zero", "random")
+"""Names of the policies without a file of their own."""
+
+
+def make_policy(spec: str) -> Policy:
+    """A policy by name, with parameters after a colon.
+
+        make_policy("tanh")                  # tuned where there are tuned parameters, otherwise the defaults
+        make_policy("linear:gain=2,cancel_drift=true")
+        make_policy("zero")
+
+    Raises:
+        ValueError: for an unknown name or parameter, naming the nearest, or a wrong value.
+    """
+    name, _, given = spec.partition(":")
+    if name in LAWS:
+        parameters = parameters_from_text(given, get_type_hints(LAWS[name]), f"policy {spec!r}")
+        return LawPolicy(name, parameters)
+    if name not in POLICIES:
+        raise ValueError(f"no policy {name!r}; {did_you_mean(name, POLICIES)}")
+    if given:
+        raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
+    return ZeroPolicy() if name == "zero" else RandomPolicy()

@@ -1,0 +1,108 @@
+"""What a policy is, and what it is told of the environment beside its observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, ObservationLayout
+from khop_env.env.layout import Float32Array
+from khop_env.physics import AgentModel
+from khop_env.simulation import Observe
+
+Observations = Mapping[str, Float32Array]
+"""Per agent (..., D_i): one observation, or one per environment of a batch."""
+
+
+@dataclass(frozen=True, eq=False)
+class EnvDescription:
+    """The environment as its designer knows it beforehand; no state, and no way to one.
+
+    Attributes:
+        environment: e.g. "consensus_v0".
+        scenario: name of the scenario.
+        observe: what stands in the slots of agents out of earshot.
+        control_period: time between actions in s.
+        models: the model of each agent that acts, by id, in the environment's order.
+        layouts: what each agent's observation holds.
+        action_sizes: entries of each agent's action, padding included.
+    """
+
+    environment: str
+    scenario: str
+    observe: Observe
+    control_period: float
+    models: Mapping[str, AgentModel]
+    layouts: Mapping[str, ObservationLayout]
+    action_sizes: Mapping[str, int]
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Ids of the agents that act."""
+        return tuple(self.models)
+
+
+class Policy(Protocol):
+    """A decision maker: all it sees are observations."""
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Get ready for new episodes.
+
+        Args:
+            env: what is known beforehand.
+            seeds: one per environment of the batch, for policies that draw random numbers.
+
+        Raises:
+            ValueError: for an environment that the policy can't act in, saying what doesn't fit.
+        """
+        ...
+
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        """Actions.
+
+        Args:
+            observations: (..., D_i) by agent.
+
+        Returns:
+            (..., m_i) in [-1, 1] by agent, padding included.
+        """
+        ...
+
+
+def describe(env: BatchedEnv | KHopEnv | KHopVectorEnv | JointEnv) -> EnvDescription:
+    """What a policy is told of an environment."""
+    batched = batched_of(env)
+    fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
+    return EnvDescription(
+        environment=f"{batched.task.name}_v0",
+        scenario=batched.scenario,
+        observe=batched.settings.observe,
+        control_period=batched.settings.control_period,
+        models={agent: fleet.models[fleet.agent(agent)] for agent in batched.agents},
+        layouts=dict(zip(batched.agents, batched.layouts, strict=True)),
+        action_sizes=dict(zip(batched.agents, sizes.tolist(), strict=True)),
+    )
+
+
+def batched_of(env: object) -> BatchedEnv:
+    """The arrays behind an environment of any kind.
+
+    Raises:
+        TypeError: for something else.
+    """
+    found = env.env.batched if isinstance(env, JointEnv) else getattr(env, "batched", env)
+    if not isinstance(found, BatchedEnv):
+        raise TypeError(f"expected an environment of khop_env; got {type(env).__name__}")
+    return found
+
+
+def by_agent(batched: BatchedEnv, observations: Float32Array) -> dict[str, Float32Array]:
+    """A `BatchedEnv`'s observations as (B, D_i) by agent."""
+    if batched.settings.uniform:
+        return {agent: observations[:, number] for number, agent in enumerate(batched.agents)}
+    offset = batched.observation_offset.tolist()
+    return {
+        agent: observations[:, first:end]
+        for agent, first, end in zip(batched.agents, offset[:-1], offset[1:], strict=True)
+    }

@@ -1,0 +1,292 @@
+"""Theorem 4 measured: how far estimation errors keep the team from its goal set.
+
+Two experiments on a scenario's closed loop, whose goal set A is agreement of the positions:
+
+- `injected_errors`: the controller sees the truth plus errors of a given size; its ultimate distance to A over that
+  size is the empirical set-ISS gain, beside the analytical one (`ComparisonGain`).
+- `swept_bounds`: the controller sees the observers' estimates, and the bounds' final value delta(inf) is swept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.laws import make_law
+from agents.lyapunov import ComparisonGain
+from khop_env.observers import DesignError, Exponential, FloatArray, TargetObservers
+from khop_env.results.metrics import consensus_error
+from khop_env.scenarios import Scenario
+from khop_env.simulation import Law, View
+
+SIZES = tuple(float(f"{size:.3g}") for size in np.geomspace(0.02, 2.0, 7))  # m
+FACTORS = tuple(float(f"{factor:.3g}") for factor in np.geomspace(10.0, 0.1, 7))  # of the scenario's delta(inf)
+PATTERNS = ("constant", "swinging", "adversarial")
+TAIL = 0.5  # of a run, in which ultimate values are taken
+BEGIN = 0.3  # of a run with observers: their transient is over, and the paired oracle run begins
+
+Progress = Callable[[float], None]
+
+
+def analytical_gain(scenario: Scenario) -> ComparisonGain | None:
+    """The gain of the scenario's law where one can be derived; None where it can only be measured."""
+    derive = getattr(make_law(scenario.law), "set_iss_gain", None)
+    return None if derive is None else derive(scenario)
+
+
+class Misinformed:
+    """A law that sees errors of a given size on what its agents can't hear.
+
+    Constant errors have random directions; swinging ones rotate between two; adversarial ones push every agent away
+    from the mean, which the Lyapunov function likes least. The stacked error of an environment always has the norm
+    `size`.
+
+    Args:
+        law: the law.
+        size: norm of the stacked error, in m.
+        unheard: (E,) the task edges that carry errors.
+        rng: draws directions and frequencies.
+        batch: environments; the patterns take turns.
+        dim: of a position.
+    """
+
+    def __init__(
+        self, law: Law, size: float, unheard: NDArray[np.bool_], rng: np.random.Generator, batch: int, dim: int
+    ) -> None:
+        self.size, self._law, self._unheard = size, law, unheard
+        shape = 2, batch, int(unheard.sum()), dim
+        self._directions = rng.normal(size=shape)
+        self._frequency = rng.uniform(0.2, 5.0, batch)  # rad/s
+        self._pattern = np.arange(batch) % len(PATTERNS)
+
+    def errors(self, t: FloatArray, view: View) -> FloatArray:
+        """(B, unheard edges, d) errors in m."""
+        one, other = self._directions
+        angle = np.where(self._pattern == 1, self._frequency * t, 0.0)[:, None, None]
+        errors = np.cos(angle) * one + np.sin(angle) * other
+        positions = view.fleet.positions(view.x)
+        away = (positions - positions.mean(axis=1, keepdims=True))[:, view.edges[self._unheard, 0]]
+        errors = np.where((self._pattern == 2)[:, None, None], away, errors)
+        length = np.sqrt((errors**2).sum(axis=(1, 2), keepdims=True))
+        return np.asarray(self.size * errors / np.maximum(length, 1e-12))
+
+    def __call__(self, t: FloatArray, view: View) -> FloatArray:
+        """The law's inputs on the truth plus errors."""
+        view.displacement[:, self._unheard] += self.errors(t, view)
+        return self._law(t, view)
+
+
+def injected_errors(
+    scenario: Scenario,
+    *,
+    sizes: Sequence[float] = SIZES,
+    episodes: int = 8,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[dict[str, Any]]:
+    """The ultimate distance to A of the law on the truth plus errors, without disturbances.
+
+    Args:
+        scenario: fleet, graphs, law.
+        sizes: norms of the stacked error in m.
+        episodes: initial states, for each pattern of errors.
+        seed: of the initial states and the errors.
+        progress: told how far it is.
+
+    Returns:
+        A row per size and pattern: error, pattern, distance (the largest in the second half of a run, over the
+        episodes), gain (distance over error), bound (analytical; None where there is none), all in m.
+    """
+    calm, bound, batch = scenario.replace(disturbance=None), analytical_gain(scenario), episodes * len(PATTERNS)
+    rows = []
+    for number, size in enumerate(sizes):
+        heard = calm.communication.has_edge
+        edges = sorted([*calm.task.edges, *((j, i) for i, j in calm.task.edges)])
+        unheard = np.array([not heard(i, j) for i, j in edges], bool)
+        law = Misinformed(
+            make_law(calm.law), size, unheard, np.random.default_rng([seed, 2]), batch, calm.fleet.position_dim
+        )
+        simulator = calm.build(law=law, observe="oracle", batch=batch)
+        x0 = [calm.initial.draw(np.random.default_rng(seed + b // len(PATTERNS))) for b in range(batch)]
+        simulator.reset(seed, x0)
+        steps = round(calm.duration / calm.dt)
+        distance = np.zeros(batch)
+        for step in range(steps):
+            simulator.step(calm.dt)
+            if step >= TAIL * steps:
+                distance = np.maximum(distance, consensus_error(calm.fleet, simulator.x))
+            if progress is not None and step % 100 == 0:
+                progress((number + step / steps) / len(sizes))
+        for kind, pattern in enumerate(PATTERNS):
+            worst = float(distance[kind :: len(PATTERNS)].max())
+            analytical = None if bound is None else _finite(bound.ultimate(size))
+            rows.append(
+                {"error": size, "pattern": pattern, "distance": worst, "gain": worst / size, "bound": analytical}
+            )
+    return rows
+
+
+def swept_bounds(
+    scenario: Scenario,
+    *,
+    factors: Sequence[float] = FACTORS,
+    episodes: int = 16,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[dict[str, Any]]:
+    """The distance to A on estimates, for bounds that end at multiples of the scenario's.
+
+    After the observers' transient each run is paired with one from the same state whose law sees the truth: the floor.
+    The excess of the distance over it is what the estimates cost. Every combination runs with and without disturbances,
+    with the scenario's observers ("as designed"), and with those that know neither drift nor inputs ("bare", Theorem
+    2), whose errors don't vanish when the team agrees.
+
+    Args:
+        scenario: fleet, graphs, observers, law; its bounds have to be `Exponential`.
+        factors: of delta(inf).
+        episodes: of each row.
+        seed: of the initial states and disturbances.
+        progress: told how far it is.
+
+    Returns:
+        A row per factor, kind of observers, and with or without disturbance: observers, disturbed, factor, delta
+        (the smallest delta(inf) of a position, in m), error (largest norm of the errors that the law reads, in m),
+        floor, distance, excess (means over episodes of the largest values in the last half after the transient, in m),
+        bound (what the analytical gain allows, in m: without disturbances on the distance, which the comparison
+        equation of `ComparisonGain` bounds from the errors measured; with them on the excess, gamma of the largest
+        error; None where it says nothing), holds (whether every run kept it), normalized (largest |xi| / rho).
+
+    Raises:
+        ValueError: for bounds that aren't `Exponential`.
+    """
+    designs: list[tuple[str, bool, float]] = [
+        (kind, disturbed, factor)
+        for kind in ("as designed", "bare")
+        for disturbed in (False, True)
+        for factor in factors
+    ]
+    rows = []
+    for number, (kind, disturbed, factor) in enumerate(designs):
+        variant = with_final_bounds(scenario, factor)
+        if kind == "bare":
+            variant = variant.replace(
+                observers=(TargetObservers(drift=False, input_observer=False),) * len(variant.models), theta=None
+            )
+        if not disturbed or variant.disturbance is None:
+            variant = variant.replace(disturbance=None)
+        if disturbed and scenario.disturbance is None:
+            continue
+        try:
+            measured = _paired(variant, episodes, seed)
+        except DesignError as error:
+            if kind == "bare":
+                continue  # inputs without a bound: they need their observers
+            raise DesignError(f"delta(inf) x {factor:g}: {error}") from error
+        rows.append({"observers": kind, "disturbed": disturbed, "factor": factor, **measured})
+        if progress is not None:
+            progress((number + 1) / len(designs))
+    return rows
+
+
+def slope(rows: Sequence[Mapping[str, Any]], x: str, y: str) -> float | None:
+    """D log y / d log x, by least squares over rows where both are positive; None for fewer than two."""
+    points = np.log([(row[x], row[y]) for row in rows if row[x] > 0.0 and row[y] > 0.0])
+    if len(points) < 2:
+        return None
+    return float(np.polyfit(points[:, 0], points[:, 1], 1)[0])
+
+
+def with_final_bounds(scenario: Scenario, factor: float) -> Scenario:
+    """The scenario with every delta(inf) multiplied, what is above it kept.
+
+    Raises:
+        ValueError: for bounds that aren't `Exponential`.
+    """
+
+    def scaled(bound: Any) -> Exponential:
+        if not isinstance(bound, Exponential):
+            raise ValueError(f"only Exponential bounds can be swept; {scenario.name!r} has {bound!r}")
+        return Exponential(bound.initial + (factor - 1.0) * bound.final, factor * bound.final, bound.rate)
+
+    delta = scenario.delta
+    if not isinstance(delta, Mapping):
+        return scenario.replace(delta=scaled(delta))
+    return scenario.replace(
+        delta={
+            kind: [scaled(one) for one in bound] if isinstance(bound, Sequence) else scaled(bound)
+            for kind, bound in delta.items()
+        }
+    )
+
+
+def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
+    """Runs on estimates, and from their states after the transient runs on the truth."""
+    run, oracle = (
+        scenario.build(law=make_law(scenario.law), observe=mode, batch=episodes) for mode in ("estimate", "oracle")
+    )
+    run.reset(seed)
+    read, truth = _read_columns(scenario)
+    steps = round(scenario.duration / scenario.dt)
+    begin, tail = round(BEGIN * steps), round((1.0 - TAIL * (1.0 - BEGIN)) * steps)
+    distance, floor, error, allowed, excess = np.zeros((5, episodes))
+    excess -= math.inf
+    comparison = None if scenario.disturbance is not None else analytical_gain(scenario)
+    before, kept = np.zeros(episodes), True
+    for step in range(steps):
+        if step == begin:
+            oracle.restore(run.save())
+            limit = consensus_error(run.fleet, run.x)
+        run.step(scenario.dt)
+        now = np.linalg.norm(run.estimates[:, read] - run.x[:, truth], axis=1)
+        if step < begin:
+            before = now
+            continue
+        oracle.step(scenario.dt)
+        mine, its = consensus_error(run.fleet, run.x), consensus_error(run.fleet, oracle.x)
+        error = np.maximum(error, now)
+        if comparison is not None:
+            limit = comparison.step(limit, np.maximum(now, before), scenario.dt)
+            kept &= bool(np.all(mine <= limit * (1.0 + 1e-9)))
+        before = now
+        if step >= tail:
+            distance, floor, excess = np.maximum(distance, mine), np.maximum(floor, its), np.maximum(excess, mine - its)
+            allowed = np.maximum(allowed, limit)
+    gain = analytical_gain(scenario)
+    bound = None
+    if comparison is not None:
+        bound = _finite(float(allowed.max()))
+    elif gain is not None:
+        bound = _finite(gain.ultimate(float(error.max())))
+        kept = bound is not None and bool(np.all(excess <= bound))
+    layout = scenario.design.states.layout
+    positions = np.isin(layout.row_source, scenario.fleet.position_index)
+    return {
+        "delta": min(one.infimum() for one, used in zip(scenario.design.states.bounds, positions, strict=True) if used),
+        "error": float(error.max()),
+        "floor": float(floor.mean()),
+        "distance": float(distance.mean()),
+        "excess": float(excess.mean()),
+        "bound": bound,
+        "holds": None if bound is None else kept,
+        "normalized": float(max(run.extremes.normalized.max(), run.extremes.input_normalized.max())),
+    }
+
+
+def _read_columns(scenario: Scenario) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns of the estimates that the law reads, and of the states that they are estimates of."""
+    fleet, slot = scenario.fleet, scenario.design.states.layout.slot
+    read, truth = [], []
+    for one, other in scenario.task.edges:
+        for i, j in ((one, other), (other, one)):
+            if not scenario.communication.has_edge(i, j):
+                read.append(slot[i, j] + fleet.position_index[j] - fleet.state_offset[j])
+                truth.append(fleet.position_index[j])
+    return np.array(read, np.int64).reshape(-1), np.array(truth, np.int64).reshape(-1)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,137 @@
+"""`khop evaluate`: a table of policies and observation modes over the same episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from khop_env.commands.common import JsonOption, mistakes, print_json
+from khop_env.terminal import Progress, print_table, say, waiting
+
+if TYPE_CHECKING:
+    from agents.comparison import Comparison
+
+EnvironmentArgument = Annotated[str, typer.Argument(metavar="ENV", help="One of those that khop list names.")]
+EnvironmentScenario = Annotated[
+    str | None, typer.Option("--scenario", help="As for khop run; by default the environment's own.")
+]
+
+
+def evaluate(
+    environment: EnvironmentArgument,
+    scenario: EnvironmentScenario = None,
+    policies: Annotated[
+        str, typer.Option(help="Names, with parameters after a colon: tanh,linear:gain=2,cancel_drift=true,zero.")
+    ] = "tanh,linear,zero,random",
+    observe: Annotated[str, typer.Option(help="Observation modes.")] = "estimate,oracle,local",
+    episodes: Annotated[int, typer.Option(min=1, help="Of each row, the same for all.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first episode.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; the numbers don't depend on how many.")] = 1,
+    ray: Annotated[bool, typer.Option("--ray", help="Play on a Ray cluster.")] = False,
+    figure: Annotated[Path | None, typer.Option(help="Draw the task error over time into this image file.")] = None,
+    csv: Annotated[bool, typer.Option("--csv", help="Print a line per episode instead of the table.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Play policies over the same episodes, and print what they return and how well they do."""
+    from agents.comparison import compare
+
+    with mistakes():
+        if csv and as_json:
+            raise ValueError("--csv and --json: choose one of them")
+        if figure is not None:
+            figure.parent.mkdir(parents=True, exist_ok=True)  # before anything is played that could be lost
+        with Progress(f"playing {environment}") as progress:
+            comparison = compare(
+                environment,
+                split_policies(policies),
+                [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
+                scenario=scenario,
+                seeds=range(seed, seed + episodes),
+                workers=workers,
+                ray=ray,
+                progress=progress,
+            )
+    if as_json:
+        print_json(comparison.summary())
+    elif csv:
+        typer.echo(comparison.frame().write_csv(), nl=False)
+    else:
+        print_comparison(comparison)
+    if figure is not None:
+        from khop_env.results.curves import error_over_time
+
+        first = comparison.rows[0].episodes
+        errors = {(row.policy, str(row.observe)): row.episodes.task_error for row in comparison.rows}
+        title = f"{comparison.environment} on {comparison.scenario}: median and middle half of {episodes} episodes"
+        with mistakes(), waiting(f"drawing {figure}"):
+            error_over_time(first.time, errors, figure, title)
+        say(f"figure: {figure}")
+
+
+def split_policies(text: str) -> list[str]:
+    """Policies from "tanh,linear:gain=2,cancel_drift=true": what only sets a parameter belongs to the one before.
+
+    Raises:
+        ValueError: for no policy, or one named twice.
+    """
+    found: list[str] = []
+    for piece in filter(None, (part.strip() for part in text.split(","))):
+        if "=" in piece and ":" not in piece and found:
+            found[-1] += f",{piece}"
+        else:
+            found.append(piece)
+    if not found:
+        raise ValueError("name at least one policy, e.g. --policies tanh,zero")
+    for spec in found:
+        if found.count(spec) > 1:
+            raise ValueError(f"--policies names {spec!r} twice")
+    return found
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """The table."""
+    rows = []
+    for number, row in enumerate(comparison.rows):
+        seen = row.summary()
+        more, interval = comparison.difference(row)
+        settling = seen["settling_time"]
+        rows.append(
+            (
+                row.policy,
+                row.observe,
+                _with_interval(seen["mean_return"], seen["ci95"]),
+                _with_interval(more, interval, sign="+") if number else "",
+                f"{seen['final_task_error']:.3g}",
+                "never" if settling is None else f"{settling:.3g}",
+                f"{seen['effort']:.3g}",
+                f"{seen['max_normalized_disagreement']:.3f}",
+                f"{seen['max_error_to_bound']:.3f}",
+            )
+        )
+    header = (
+        "policy",
+        "observe",
+        "return",
+        "to first row",
+        "error (m)",
+        "settled (s)",
+        "effort",
+        "|e| max",
+        "error/bound",
+    )
+    count = len(comparison.rows[0].episodes.returns)
+    title = f"{comparison.environment} on {comparison.scenario}, {count} episodes, the same for every row"
+    print_table(header, rows, title)
+    typer.echo(
+        "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; error: task\n"
+        "error at the end; settled: median time from which the team's error stays below a tenth of the initial one;\n"
+        "|e| and error/bound: largest of all observers, below 1 by guarantee"
+    )
+
+
+def _with_interval(value: float, interval: float | None, sign: str = "") -> str:
+    digits = 3 if abs(value) < 10 else 2 if abs(value) < 1000 else 1
+    text = f"{value:{sign}.{digits}f}"
+    return text if interval is None else f"{text} ± {interval:.{digits}f}"

@@ -1,0 +1,113 @@
+"""`khop iss`: the closed-loop theorem, measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from khop_env.commands.common import JsonOption, ScenarioArgument, folder_name, load, mistakes, print_json
+from khop_env.terminal import Progress, print_table, waiting
+
+
+def iss(
+    name: ScenarioArgument,
+    episodes: Annotated[int, typer.Option(min=1, help="Of each row.")] = 16,
+    seed: Annotated[int, typer.Option(min=0, help="Of initial states, errors and disturbances.")] = 0,
+    duration: Annotated[float | None, typer.Option(help="Of a run in seconds; by default the scenario's.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; by default runs/iss/SCENARIO.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure Theorem 4: how near to its goal the team comes with errors of a given size, and with tighter bounds.
+
+    Exits with 1 if a run came out farther than the analytical gain allows.
+    """
+    import polars as pl
+
+    from agents.set_iss import analytical_gain, injected_errors, slope, swept_bounds
+    from khop_env.results.curves import set_iss_figure
+
+    with mistakes(name), waiting(f"designing the observers of {name}"):
+        scenario = load(name)
+        if duration is not None:
+            scenario = scenario.replace(duration=duration)
+        gain = analytical_gain(scenario)
+        folder = out or Path("runs") / "iss" / folder_name(scenario.name)
+        folder.mkdir(parents=True, exist_ok=True)
+    with mistakes(name):
+        with Progress("injecting errors") as progress:
+            injected = injected_errors(scenario, episodes=episodes, seed=seed, progress=progress)
+        with Progress("sweeping the bounds") as progress:
+            swept = swept_bounds(scenario, episodes=episodes, seed=seed, progress=progress)
+        files = {key: folder / f"{key}.csv" for key in ("injected", "swept")} | {"figure": folder / "figure.png"}
+        with waiting(f"writing {folder}"):
+            for key, rows in (("injected", injected), ("swept", swept)):
+                pl.DataFrame(rows, infer_schema_length=None).write_csv(files[key])
+            title = f"{scenario.name}, law {scenario.law.name}: set-ISS with respect to estimation errors (Theorem 4)"
+            set_iss_figure(injected, swept, files["figure"], title)
+    slopes = [
+        {
+            "observers": kind,
+            "disturbed": disturbed,
+            "slope": slope(mine, "delta", "excess" if disturbed else "distance"),
+        }
+        for kind, disturbed in dict.fromkeys((row["observers"], row["disturbed"]) for row in swept)
+        for mine in [[row for row in swept if (row["observers"], row["disturbed"]) == (kind, disturbed)]]
+    ]
+    broken = [row for row in injected if row["bound"] is not None and row["distance"] > row["bound"]]
+    broken += [row for row in swept if row["holds"] is False]
+    if as_json:
+        region = None if gain is None else gain.region()
+        found = {"scenario": scenario.name, "law": scenario.law.name, "analytical_region": region, "holds": not broken}
+        _print = {**found, "injected": injected, "swept": swept, "slopes": slopes}
+        print_json({**_print, "files": {key: str(path) for key, path in files.items()}})
+    else:
+        _print_tables(injected, swept, slopes)
+        if gain is None:
+            typer.echo("analytical gain: none for this law and scenario; measured only")
+        else:
+            verdict = f"{len(broken)} rows exceed it" if broken else "no run exceeds it"
+            typer.echo(f"analytical gain: holds for distances up to {gain.region():.3g} m; {verdict}")
+        typer.echo(f"tables: {files['injected']}, {files['swept']}\nfigure: {files['figure']}")
+    if broken:
+        raise typer.Exit(1)
+
+
+def _print_tables(
+    injected: Sequence[Mapping[str, Any]], swept: Sequence[Mapping[str, Any]], slopes: Sequence[Mapping[str, Any]]
+) -> None:
+    print_table(
+        ("error (m)", "pattern", "distance (m)", "gain", "allowed (m)"),
+        [
+            (_n(row["error"]), row["pattern"], *(_n(row[key]) for key in ("distance", "gain", "bound")))
+            for row in injected
+        ],
+        "(a) The law on the truth plus errors, no disturbance: ultimate distance to the goal set",
+    )
+    typer.echo()
+    keys = ("delta", "error", "floor", "distance", "excess", "bound")
+    print_table(
+        (
+            "observers",
+            "disturbed",
+            "delta(inf)",
+            "errors (m)",
+            "oracle (m)",
+            "distance (m)",
+            "excess (m)",
+            "allowed (m)",
+        ),
+        [(row["observers"], "yes" if row["disturbed"] else "no", *(_n(row[key]) for key in keys)) for row in swept],
+        "(b) The law on estimates, paired with the law on the truth (oracle) after the transient",
+    )
+    typer.echo("allowed: by the analytical gain, on the distance without disturbance and on the excess with it")
+    for row in slopes:
+        what = "excess with disturbance" if row["disturbed"] else "distance without disturbance"
+        text = "none: it is down at rounding" if row["slope"] is None else f"{row['slope']:.2f}"
+        typer.echo(f"slope of log {what} over log delta(inf), observers {row['observers']}: {text}")
+
+
+def _n(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"

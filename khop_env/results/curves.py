@@ -1,0 +1,119 @@
+"""Figures of many episodes: median and spread over time, and ultimate distances against bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from khop_env.observers import FloatArray
+from khop_env.results.figures import COLORS, STYLE
+
+_DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
+
+
+def error_over_time(
+    time: FloatArray, errors: Mapping[tuple[str, str], FloatArray], path: str | Path, title: str
+) -> Path:
+    """Task error over time per row: the median over episodes, and the band that holds the middle half.
+
+    Args:
+        time: (T,) in s.
+        errors: (T, E) in m by (policy, observation mode): policies differ in colour, modes in dashes.
+        path: of the image file.
+        title: of the figure.
+
+    Returns:
+        The path.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    policies = list(dict.fromkeys(policy for policy, _ in errors))
+    modes = list(dict.fromkeys(mode for _, mode in errors))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8.4, 4.6), layout="constrained")
+        axes = figure.subplots()
+        for (policy, mode), values in errors.items():
+            color = COLORS[policies.index(policy) % len(COLORS)]
+            low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=1)
+            dashes = _DASHES[modes.index(mode) % len(_DASHES)]
+            axes.plot(time, middle, color=color, linestyle=dashes, label=f"{policy} on {mode}")
+            axes.fill_between(time, low, high, color=color, alpha=0.12, linewidth=0.0)
+        axes.set_yscale("log")
+        axes.set_xlim(0.0, float(time[-1]))
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel("task error, mean over agents (m)")
+        figure.suptitle(title, fontsize=10.5, color="#333333")
+        figure.legend(loc="outside right center", fontsize=8.5, handlelength=3.0)
+        figure.savefig(path, dpi=150)
+    return Path(path)
+
+
+def set_iss_figure(
+    injected: Sequence[Mapping[str, Any]], swept: Sequence[Mapping[str, Any]], path: str | Path, title: str
+) -> Path:
+    """Theorem 4 in two panels: ultimate distance to the goal set against errors, and against delta(inf).
+
+    Args:
+        injected: rows of `agents.set_iss.injected_errors`.
+        swept: rows of `agents.set_iss.swept_bounds`.
+        path: of the image file.
+        title: of the figure.
+
+    Returns:
+        The path.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        patterns = list(dict.fromkeys(row["pattern"] for row in injected))
+        for color, pattern, marker in zip(COLORS, patterns, "osD", strict=False):
+            rows = [row for row in injected if row["pattern"] == pattern]
+            points = [row["error"] for row in rows], [row["distance"] for row in rows]
+            left.plot(*points, color=color, marker=marker, markersize=5, label=f"{pattern} errors")
+        bound = {row["error"]: row["bound"] for row in injected if row["bound"] is not None}
+        if bound:
+            left.plot(
+                [*bound], [*bound.values()], color="black", linestyle=(0, (5, 2)), label=r"analytical gain $\gamma$"
+            )
+        left.set_title("(a) Injected errors, no disturbance", loc="left")
+        left.set_xlabel("norm of the errors that the law reads (m)")
+        left.set_ylabel("ultimate distance to the goal set (m)")
+        for color, (observers, disturbed), marker in zip(
+            (*COLORS[:3], COLORS[4]),
+            dict.fromkeys((row["observers"], row["disturbed"]) for row in swept),
+            "osD^",
+            strict=False,
+        ):
+            rows = [row for row in swept if (row["observers"], row["disturbed"]) == (observers, disturbed)]
+            quantity = "excess" if disturbed else "distance"
+            points = (
+                [row["delta"] for row in rows if row[quantity] > 0.0],
+                [row[quantity] for row in rows if row[quantity] > 0.0],
+            )
+            calm = "with" if disturbed else "no"
+            label = f"{quantity}, observers {observers}, {calm} disturbance"
+            right.plot(*points, color=color, marker=marker, markersize=5, label=label)
+        floors = [row["floor"] for row in swept if row["disturbed"]]
+        if floors:
+            right.axhline(
+                float(np.mean(floors)), color=COLORS[3], linestyle=(0, (1.5, 1.5)), label="oracle's own floor"
+            )
+        right.set_title(r"(b) Estimates, with the bound's final value $\delta(\infty)$ swept", loc="left")
+        right.set_xlabel(r"$\delta(\infty)$ (m)")
+        right.set_ylabel("ultimate distance, or its excess over the oracle's (m)")
+        for axes in (left, right):
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high * (high / low) ** 0.3)  # room for the legend
+            axes.legend(loc="upper left", fontsize=8.5)
+        figure.suptitle(title, fontsize=10.5, color="#333333")
+        figure.savefig(path, dpi=150)
+    return Path(path)
