@@ -50,7 +50,7 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         super().reset(seed=seed)
         batched = self.env.batched
         observations, infos = batched.reset(seed, initial_states=initial_states(batched.fleet, options))
-        return observations.reshape(-1), self._info(infos)
+        return observations.reshape(-1), self._info(infos, begins=True)
 
     def step(self, action: ArrayLike) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """Advance by one control period.
@@ -80,8 +80,8 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         """Close the window, if there is one."""
         self.env.close()
 
-    def _info(self, infos: Infos) -> dict[str, Any]:
-        shown = self.env.shown(infos)
+    def _info(self, infos: Infos, *, begins: bool = False) -> dict[str, Any]:
+        shown = self.env.shown(infos, begins=begins)
         values = [np.array([one[key] for one in shown.values()]) for key in INFO_KEYS]
         error, normalized, relative, observations, actions = values
         team = error.mean(), normalized.max(), relative.max(), observations.sum(), actions.sum()

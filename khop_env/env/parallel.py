@@ -41,6 +41,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         batched: the environment as arrays.
 
     Raises:
+        ModuleNotFoundError: for a render mode without pygame-ce.
         ValueError: for an unknown render mode, or several copies.
     """
 
@@ -74,15 +75,17 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self._actions = np.zeros((1, int(batched.action_offset[-1])))
         self._begun = False
         self._renderer: Renderer | None = None
+        if render_mode is not None:
+            from khop_env.env.rendering import Renderer
+
+            task = batched.task
+            self._renderer = Renderer(batched.simulator.design, task.edges, leaders=task.leaders, title=name)
 
     def __repr__(self) -> str:
         return f"KHopEnv({self.metadata['name']}, {len(self.possible_agents)} agents)"
 
     def __str__(self) -> str:
         return str(self.metadata["name"])
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_renderer": None}
 
     def observation_space(self, agent: str) -> Box:
         """The same object at every call."""
@@ -111,7 +114,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             DesignError: for initial states that the observers can't start from.
         """
         observations, infos = self.batched.reset(seed, initial_states=initial_states(self.batched.fleet, options))
-        return self._by_agent(observations), self.shown(infos)
+        return self._by_agent(observations), self.shown(infos, begins=True)
 
     def step(self, actions: Mapping[str, Float32Array]) -> ParallelStep:
         """Advance by one control period.
@@ -149,8 +152,9 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
     def set_state(self, state: EnvState) -> None:
         """Continue from `get_state()`'s result, bit for bit."""
         self.batched.set_state(state)
-        self._begun = self._begun or not state.over[0]
+        self._begun = state.generators[0] is not None
         self.agents = [] if state.over[0] else list(self.possible_agents)
+        self._remember(begins=True)
 
     def render(self) -> NDArray[np.uint8] | None:
         """A frame (H, W, 3) in mode "rgb_array"; shows it in mode "human".
@@ -158,17 +162,18 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         Raises:
             ValueError: without a render mode, or before the first reset.
         """
-        if self.render_mode is None:
+        if self._renderer is None:
             raise ValueError(
                 "render() needs a render mode: make the environment with render_mode='rgb_array' or 'human'"
             )
-        return self._draw()
+        if not self._begun:
+            raise ValueError("there is nothing to render yet: call reset() first")
+        return self._draw(self._renderer)
 
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._renderer is not None:
             self._renderer.close()
-            self._renderer = None
 
     def _known(self, agent: str) -> str:
         if agent not in self._layouts:
@@ -203,23 +208,31 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         flat = observations.reshape(-1)
         return {agent: flat[part] for agent, part in self._columns.items()}
 
-    def shown(self, infos: Infos) -> dict[str, dict[str, float]]:
-        """Infos by agent, after `agents` and the window have been brought up to date with `batched`."""
+    def shown(self, infos: Infos, *, begins: bool = False) -> dict[str, dict[str, float]]:
+        """Infos by agent, after `agents`, trails and the window have been brought up to date with `batched`.
+
+        Args:
+            infos: of `batched`.
+            begins: whether an episode has just begun.
+        """
         self._begun = True
         self.agents = [] if self.batched.over[0] else list(self.possible_agents)
-        if self.render_mode == "human":
-            self._draw()
+        self._remember(begins=begins)
+        if self._renderer is not None and self.render_mode == "human":
+            self._draw(self._renderer)
         rows = zip(*(infos[key][0].tolist() for key in INFO_KEYS), strict=True)
         return {agent: dict(zip(INFO_KEYS, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
 
-    def _draw(self) -> NDArray[np.uint8] | None:
-        if not self._begun:
-            raise ValueError("there is nothing to render yet: call reset() first")
-        simulator, task = self.batched.simulator, self.batched.task
+    def _remember(self, *, begins: bool) -> None:
+        """Add to the trails, or begin new ones: whoever renders seldom sees the whole path."""
         if self._renderer is None:
-            from khop_env.env.rendering import Renderer
+            return
+        if begins:
+            self._renderer.restart()
+        self._renderer.remember(float(self.batched.simulator.t[0]), self.batched.simulator.x[0])
 
-            self._renderer = Renderer(simulator.design, task.edges, leaders=task.leaders, title=str(self))
+    def _draw(self, renderer: Renderer) -> NDArray[np.uint8] | None:
+        simulator = self.batched.simulator
         seen = simulator.extremes
         normalized = max(float(seen.normalized[0]), float(seen.input_normalized[0]))
         task_error = float(self.batched.task_errors().mean())
@@ -231,8 +244,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             task_error,
         )
         if self.render_mode == "rgb_array":
-            return self._renderer.frame(*scene)
-        self._renderer.show(*scene)
+            return renderer.frame(*scene)
+        renderer.show(*scene)
         return None
 
 

@@ -101,7 +101,30 @@ class Renderer:
         self._canvas: Canvas | None = None
         self._window: Window | None = None
         self._dismissed = False
-        self._restart()
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new episode: forget the trails, and where view and labels were."""
+        self._trail: deque[tuple[float, FloatArray]] = deque()
+        self._drawn = -math.inf
+        self._labels = Labels()
+        self._camera = Camera(self._map, margin=38 * self._unit)
+
+    def remember(self, t: float, x: FloatArray) -> None:
+        """Add to the trails, without a picture. A time before the last one's begins a new episode.
+
+        Args:
+            t: in s.
+            x: (n,) state of the fleet.
+        """
+        if self._trail and t < self._trail[-1][0]:
+            self.restart()
+        trail = self._trail
+        if (trail and t == trail[-1][0]) or (len(trail) > 1 and t - trail[-2][0] < TRAIL / 100):
+            trail.pop()  # the same moment, or finer than can be seen
+        trail.append((t, self._positions(x)))
+        while trail[0][0] < t - TRAIL:
+            trail.popleft()
 
     def frame(
         self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None = None
@@ -152,11 +175,6 @@ class Renderer:
         """Without the window, surfaces and fonts, which can't be copied."""
         return {**self.__dict__, "_canvas": None, "_window": None}
 
-    def _restart(self) -> None:
-        self._trail: deque[tuple[float, FloatArray]] = deque()
-        self._labels = Labels()
-        self._camera = Camera(self._map, margin=38 * self._unit)
-
     def _span(self, kind: str) -> str:
         names = [name for name, model in zip(self._names, self._fleet.models, strict=True) if model.type == kind]
         return names[0] if len(names) == 1 else f"{names[0]}–{names[-1]}"
@@ -165,10 +183,10 @@ class Renderer:
         self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None
     ) -> Canvas:
         canvas = self._canvas = self._canvas or Canvas(self._size)
-        positions = sensible(x[self._fleet.position_index[:, :2]])
-        ghosts = self._beliefs.positions(estimates)
-        elapsed = self._remember(t, positions)
-        self._follow(positions, ghosts, elapsed)
+        self.remember(t, x)
+        positions, ghosts = self._positions(x), self._beliefs.positions(estimates)
+        self._follow(positions, ghosts, t - self._drawn)
+        self._drawn = t
         everyone, targets = np.arange(len(positions)), np.array(self._beliefs.targets, int)
         middles, haunts = self._pixels(positions, everyone), self._pixels(ghosts, targets)
 
@@ -186,17 +204,9 @@ class Renderer:
         canvas.finish()
         return canvas
 
-    def _remember(self, t: float, positions: FloatArray) -> float:
-        """Add to the trails, and return the time since the last frame: infinite for the first."""
-        if self._trail and t < self._trail[-1][0]:
-            self._restart()
-        elapsed = t - self._trail[-1][0] if self._trail else math.inf
-        if len(self._trail) > 1 and t - self._trail[-2][0] < TRAIL / 100:
-            self._trail.pop()  # finer than can be seen
-        self._trail.append((t, positions))
-        while self._trail[0][0] < t - TRAIL:
-            self._trail.popleft()
-        return elapsed
+    def _positions(self, x: FloatArray) -> FloatArray:
+        """(N, d) positions in m, d at most 2; nan where they make no sense."""
+        return sensible(x[self._fleet.position_index[:, :2]])
 
     def _follow(self, positions: FloatArray, ghosts: FloatArray, elapsed: float) -> None:
         final = self._beliefs.final_half_widths()
