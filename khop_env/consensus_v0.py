@@ -147,7 +147,10 @@ def parallel_env(
 
 
 def env(scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Any) -> AECEnv:
-    """The AEC environment, by PettingZoo's own conversion; arguments as listed at the top of this module."""
+    """The AEC environment, by PettingZoo's own conversion; arguments as listed at the top of this module.
+
+    What an observation holds: `aec.unwrapped.layout(agent)`.
+    """
     return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **arguments))
 
 

@@ -10,7 +10,7 @@
 | Agents               | 5                                                  |
 | Action Shape         | (2,); the most inputs that an agent has            |
 | Action Values        | [-1, 1]                                            |
-| Observation Shape    | (59,)                                              |
+| Observation Shape    | (51,)                                              |
 | Observation Values   | [-200, 200]; `limit` chooses them                  |
 | State Shape          | (16,)                                              |
 | State Values         | [-100, 100]                                        |
@@ -166,7 +166,10 @@ def parallel_env(
 
 
 def env(scenario: Scenario | str | Path = "convoy", *, render_mode: str | None = None, **arguments: Any) -> AECEnv:
-    """The AEC environment, by PettingZoo's own conversion; arguments as listed at the top of this module."""
+    """The AEC environment, by PettingZoo's own conversion; arguments as listed at the top of this module.
+
+    What an observation holds: `aec.unwrapped.layout(agent)`.
+    """
     return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **arguments))
 
 

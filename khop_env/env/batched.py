@@ -12,6 +12,7 @@ from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.kernels import judge, read_actions
 from khop_env.env.layout import Float32Array, ObservationLayout
 from khop_env.env.leaders import LeaderRoutes
+from khop_env.env.options import seeds
 from khop_env.env.settings import Settings
 from khop_env.env.state import INFO_KEYS, EnvState, Infos, Step
 from khop_env.env.tasks import Task
@@ -95,21 +96,17 @@ class BatchedEnv:
             Observations and infos of all copies.
 
         Raises:
-            ValueError: for not R seeds, or initial states of a wrong shape or infinite; nothing has been reset then.
+            ValueError: for a seed that isn't a non-negative integer, not R of them, or initial states of a wrong shape
+                or infinite; nothing has been reset then.
             DesignError: for initial states that the observers can't start from; likewise.
         """
         which = self.simulator.chosen(copies)
-        if seed is None or isinstance(seed, int | np.integer):
-            seeds = [None if seed is None else int(seed) + int(b) for b in which]
-        else:
-            seeds = list(seed)
-        if len(seeds) != len(which):
-            raise ValueError(f"expected one seed or {len(which)}, one per copy that is reset; got {len(seeds)}")
-        generators = [self._generator(int(b), one) for b, one in zip(which, seeds, strict=True)]
+        chosen = seeds(seed, which)
+        generators = [self._generator(int(b), one) for b, one in zip(which, chosen, strict=True)]
         if initial_states is not None:
             initial_states = self._completed(np.asarray(initial_states, dtype=float), generators)
         self.simulator.reset(generators, initial_states, which)
-        for b, one, generator in zip(which.tolist(), seeds, generators, strict=True):
+        for b, one, generator in zip(which.tolist(), chosen, generators, strict=True):
             self._generators[b] = generator
             self._seeded[b] |= one is not None
             if self._routes is not None:

@@ -47,9 +47,9 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
             seed: as for the ParallelEnv.
             options: likewise.
         """
-        super().reset(seed=seed)
         batched = self.env.batched
         observations, infos = batched.reset(seed, initial_states=initial_states(batched.fleet, options))
+        super().reset(seed=seed)
         return observations.reshape(-1), self._info(infos, begins=True)
 
     def step(self, action: ArrayLike) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:

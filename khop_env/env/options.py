@@ -1,17 +1,38 @@
-"""What `reset(options=...)` takes, checked."""
+"""What `reset` takes, checked."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import Fleet, did_you_mean
 
 RESET_OPTIONS = ("initial_state",)
+
+
+def seeds(seed: int | Sequence[int | None] | None, copies: IntArray) -> list[int | None]:
+    """A seed, or none, for each of the copies that are reset.
+
+    Args:
+        seed: copy b gets seed + b; or one per copy.
+        copies: (R,) their numbers.
+
+    Raises:
+        ValueError: for a seed that isn't a non-negative integer, or not R of them.
+    """
+    given = list(seed) if isinstance(seed, Iterable) else [seed]
+    for one in given:
+        if one is not None and not (isinstance(one, int | np.integer) and one >= 0):
+            raise ValueError(f"a seed must be a non-negative integer, or None; got {one!r}")
+    if not isinstance(seed, Iterable):
+        return [None if seed is None else int(seed) + b for b in copies.tolist()]
+    if len(given) != len(copies):
+        raise ValueError(f"expected one seed or {len(copies)}, one per copy that is reset; got {len(given)}")
+    return given
 
 
 def initial_states(fleet: Fleet, options: Mapping[str, Any] | None) -> FloatArray | None:

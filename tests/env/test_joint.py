@@ -108,6 +108,16 @@ def test_bad_actions_are_refused_and_change_nothing(wrong, message):
     assert same(state(env.env), state(clean.env))
 
 
+def test_bad_seeds_are_refused_and_change_nothing():
+    """In the same words as by the ParallelEnv, not in Gymnasium's."""
+    env, clean = made(), made()
+    assert same(env.reset(seed=1), clean.reset(seed=1))
+    with pytest.raises(ValueError, match="a seed must be a non-negative integer, or None; got -1"):
+        env.reset(seed=-1)
+    assert env.np_random_seed == 1
+    assert same(env.step(np.zeros(16)), clean.step(np.zeros(16)))
+
+
 def test_steps_outside_an_episode_are_refused():
     """Before the first reset, and after the end."""
     env = made(max_cycles=1)

@@ -221,8 +221,8 @@ def test_bad_resets_are_refused_and_change_nothing():
     n = env.batched.fleet.n
     for arguments, message in (
         ({"seed": [1, 2]}, "expected one seed or 3, one per copy that is reset; got 2"),
-        ({"seed": [1, 2, -3]}, "non-negative"),
-        ({"seed": -1}, "non-negative"),
+        ({"seed": [1, 2, -3]}, "a seed must be a non-negative integer, or None; got -3"),
+        ({"seed": -1}, "a seed must be a non-negative integer, or None; got -1"),
         ({"options": {"initial_state": np.zeros((2, n))}}, rf"x0 must be finite, of shape \({n},\) or \(3, {n}\)"),
         ({"options": {"initial_state": np.full(n, np.inf)}}, "must be finite"),
     ):
