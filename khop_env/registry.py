@@ -115,7 +115,12 @@ def assemble(
         TypeError: for an argument that there isn't, naming the nearest.
         ValueError: for a wrong one.
     """
-    settings = Settings.of(arguments, ("scenario", "render_mode", *others))
+    if "render_mode" in arguments:
+        raise TypeError(
+            f"batches aren't rendered, and take no render_mode; got {arguments['render_mode']!r}: give it to the "
+            "environment's parallel_env, which is one copy"
+        )
+    settings = Settings.of(arguments, ("scenario", "num_envs", "render_mode", *others))
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ValueError(f"num_envs must be a positive integer; got {num_envs!r}")
     chosen = scenario_or_name if isinstance(scenario_or_name, Scenario) else scenario(scenario_or_name)

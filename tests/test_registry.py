@@ -8,7 +8,7 @@ import pytest
 
 import khop_env
 import khop_env.scenarios
-from khop_env.registry import SCENARIOS, describe, scenario, scenarios
+from khop_env.registry import SCENARIOS, describe, make_sb3_vec, make_vec, scenario, scenarios
 from khop_env.scenarios import Scenario
 from khop_env.scenarios.files import ScenarioFileError, write_scenario
 
@@ -85,6 +85,15 @@ def test_refusals(name, parameters, said):
 def test_a_missing_file():
     with pytest.raises(ScenarioFileError, match="can't be read"):
         scenario("nowhere.toml")
+
+
+@pytest.mark.parametrize("make", [make_vec, make_sb3_vec])
+def test_batches(make):
+    """What is misspelt, and what only one copy has."""
+    with pytest.raises(TypeError, match="no argument 'num_env'; did you mean 'num_envs'"):
+        make("consensus_v0", num_env=3)
+    with pytest.raises(TypeError, match="batches aren't rendered, and take no render_mode; got 'rgb_array'"):
+        make("consensus_v0", render_mode="rgb_array")
 
 
 def test_the_package_exports_lazily():

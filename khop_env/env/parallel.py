@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -123,6 +124,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             actions: one per agent, entries in [-1, 1].
 
         Raises:
+            TypeError: if `actions` isn't a mapping; nothing has changed then.
             ValueError: if no episode is running, or an action is missing, of an unknown agent, misshapen or not finite;
                 nothing has changed then.
         """
@@ -183,6 +185,11 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         return agent
 
     def _flat(self, actions: Mapping[str, Float32Array]) -> FloatArray:
+        if not isinstance(actions, Mapping):
+            raise TypeError(
+                f"step() takes a mapping with an action for each agent, {{{self.possible_agents[0]!r}: ..., ...}}; got "
+                f"{reprlib.repr(actions)} ({type(actions).__name__}); arrays of all agents go to batched.step()"
+            )
         if not self.agents:
             raise ValueError("no episode is running: it is over, or none has begun; call reset() first")
         flat = self._actions[0]

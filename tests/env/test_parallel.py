@@ -70,6 +70,19 @@ def test_bad_actions_are_refused_and_change_nothing(case, actuator):
             assert same(env.step(actions), clean.step(actions))
 
 
+@pytest.mark.parametrize("given", [None, 3, [np.zeros(2)] * 5, np.zeros((5, 2)), "left", {"drifter_1"}])
+def test_what_is_no_mapping_is_refused_and_changes_nothing(given):
+    env, clean = parallel("leader_following_v0", "convoy"), parallel("leader_following_v0", "convoy")
+    message = rf"mapping with an action for each agent, {{'drifter_1': .*\({type(given).__name__}\); arrays"
+    for seed in (1, None):
+        with pytest.raises(TypeError, match=message):  # outside of an episode, too
+            env.step(given)
+        assert same(env.reset(seed=seed), clean.reset(seed=seed))
+        with pytest.raises(TypeError, match=message):
+            env.step(given)
+        assert same(play(env, 2), play(clean, 2))
+
+
 @pytest.mark.parametrize(("environment", "name"), EVERY)
 def test_a_bad_action_of_any_agent_names_that_agent(environment, name):
     """Also where agents differ in their inputs; entries that stand for no input are ignored."""
@@ -155,12 +168,21 @@ def test_unknown_options_are_ignored_with_a_warning():
     assert same(warned, env.reset(seed=1))
 
 
-def test_bad_seeds_are_refused_and_change_nothing():
+@pytest.mark.parametrize(
+    ("seed", "got"), [(-1, "-1"), (np.int64(-3), r".*-3\)?"), (1.5, "1.5"), ("ab", "'a'"), ([-2], "-2")]
+)
+def test_bad_seeds_are_refused_and_change_nothing(seed, got):
     env, clean = parallel("consensus_v0"), parallel("consensus_v0")
     assert same(env.reset(seed=1), clean.reset(seed=1))
-    with pytest.raises(ValueError, match="non-negative"):
-        env.reset(seed=-1)
+    with pytest.raises(ValueError, match=f"a seed must be a non-negative integer, or None; got {got}$"):
+        env.reset(seed=seed)
     assert same(play(env, 2), play(clean, 2))
+
+
+def test_an_aec_environment_s_layouts_are_within():
+    env, aec = parallel("formation_v0"), formation_v0.env(built("paper"))
+    for agent in env.possible_agents:
+        assert aec.unwrapped.layout(agent).names == env.layout(agent).names
 
 
 def test_unknown_agents_have_no_spaces():
