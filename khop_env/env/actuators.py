@@ -8,7 +8,7 @@ limit how fast the inputs change. Inputs are fractions of the input limits here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Protocol
 
 import numpy as np
@@ -106,6 +106,11 @@ def as_actuator(actuator: str | Actuator) -> Actuator:
             f"no actuator {actuator!r}; {did_you_mean(actuator, ACTUATORS)} (or give one, e.g. Lag(time_constant=0.2))"
         )
     return ACTUATORS[actuator]()
+
+
+def described(actuator: Actuator) -> str:
+    """What is the same for equal actuators: the class, and the parameters of one that is a dataclass."""
+    return repr(actuator) if is_dataclass(actuator) else type(actuator).__name__
 
 
 def _require_positive(actuator: Actuator, name: str) -> None:

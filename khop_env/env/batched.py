@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import functools
+import reprlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,7 +16,7 @@ from khop_env.env.layout import Float32Array, ObservationLayout
 from khop_env.env.leaders import LeaderRoutes
 from khop_env.env.options import seeds
 from khop_env.env.settings import Settings
-from khop_env.env.state import INFO_KEYS, EnvState, Infos, Step
+from khop_env.env.state import INFO_KEYS, EnvState, Infos, Step, signature
 from khop_env.env.tasks import Task
 from khop_env.observers import FloatArray, IntArray
 from khop_env.simulation import Simulator
@@ -175,7 +177,7 @@ class BatchedEnv:
             self._inputs.copy(),
             self._cycles.copy(),
             self._over.copy(),
-            tuple(self.fleet.ids[i] for i in self.task.leaders),
+            self._signature,
             () if self._routes is None else (self._routes.drawn.copy(), self._routes.start.copy()),
             copy.deepcopy(self._generators),
             self._seeded.copy(),
@@ -185,14 +187,15 @@ class BatchedEnv:
         """Continue from `get_state()`'s result, which stays as it is.
 
         Raises:
-            ValueError: if it is of an environment of other dimensions or leaders; nothing has changed then.
+            TypeError: if it isn't one; nothing has changed then.
+            ValueError: if it is of an environment of another task, actuator or size, saying what differs; likewise.
         """
-        leaders = tuple(self.fleet.ids[i] for i in self.task.leaders)
-        if leaders != state.leaders:
-            raise ValueError(
-                f"can't restore: the state is of an environment led by {', '.join(state.leaders) or 'nobody'}, this "
-                f"one is led by {', '.join(leaders) or 'nobody'}"
+        if not isinstance(state, EnvState):
+            raise TypeError(
+                f"set_state() takes what get_state() returned, an EnvState; got {reprlib.repr(state)} "
+                f"({type(state).__name__})"
             )
+        state.require_of(self._signature)
         self.simulator.restore(state.simulator)
         self._inputs[...] = state.inputs
         self._cycles, self._over, self._seeded = state.cycles.copy(), state.over.copy(), state.seeded.copy()
@@ -201,6 +204,10 @@ class BatchedEnv:
             self._routes.drawn, self._routes.start = (one.copy() for one in state.routes)
 
     # -- parts ---------------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _signature(self) -> dict[str, tuple[str, ...]]:
+        return signature(self.fleet, self.task, self.settings.actuator)  # type: ignore[arg-type]
 
     def _generator(self, b: int, seed: int | None) -> np.random.Generator:
         mine = self._generators[b]

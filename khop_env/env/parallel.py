@@ -152,7 +152,12 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         return self.batched.get_state()
 
     def set_state(self, state: EnvState) -> None:
-        """Continue from `get_state()`'s result, bit for bit."""
+        """Continue from `get_state()`'s result, bit for bit.
+
+        Raises:
+            TypeError: if it isn't one; nothing has changed then.
+            ValueError: if it is of an environment of another task, actuator or size, saying what differs; likewise.
+        """
         self.batched.set_state(state)
         self._begun = state.generators[0] is not None
         self.agents = [] if state.over[0] else list(self.possible_agents)

@@ -99,7 +99,7 @@ def state(env: KHopEnv | BatchedEnv) -> tuple[Any, ...]:
         saved.inputs,
         saved.cycles,
         saved.over,
-        saved.leaders,
+        saved.environment,
         saved.routes,
         saved.generators,
         saved.seeded,

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from playing import EVERY, batched, built, parallel, play, random_actions, same, state
+from playing import EVERY, built, parallel, play, random_actions, same, state
 
 from khop_env import consensus_v0, formation_v0, leader_following_v0
 from khop_env.observers import DesignError
@@ -283,32 +283,6 @@ def test_rendering_needs_a_mode_and_an_episode():
     env.close()
     with pytest.raises(ValueError, match=r"there is nothing to render yet: call reset\(\) first"):
         parallel("consensus_v0", render_mode="rgb_array").render()
-
-
-def test_states_of_other_environments_are_refused_and_change_nothing():
-    """Of other scenarios, other numbers of copies, and other tasks on the same fleet."""
-    env, clean = parallel("leader_following_v0", "convoy"), parallel("leader_following_v0", "convoy")
-    assert same(env.reset(seed=1), clean.reset(seed=1))
-    others = [
-        batched("leader_following_v0", "mixed_fleet"),
-        batched("leader_following_v0", "convoy", num_envs=2),
-        batched("consensus_v0", "convoy"),
-        batched("leader_following_v0", "convoy", leaders=["drifter_0", "drifter_3", "drifter_6", "drifter_7"]),
-    ]
-    for other in others:
-        other.reset(seed=0)
-        with pytest.raises(ValueError, match="can't restore"):
-            env.set_state(other.get_state())
-        assert same(state(env), state(clean))
-    assert same(play(env, 2), play(clean, 2))
-
-
-def test_a_restored_environment_can_be_rendered():
-    """Also one that was never reset itself; the picture is that of the restored state."""
-    env, fresh = (consensus_v0.parallel_env(render_mode="rgb_array") for _ in range(2))
-    env.reset(seed=3)
-    fresh.set_state(env.get_state())
-    np.testing.assert_array_equal(fresh.render(), env.render())
 
 
 @pytest.mark.parametrize(
