@@ -20,7 +20,7 @@ _SIDES = np.array(  # of a marker, in the order in which they are tried
         *([1, -0.5], [1, 0.5], [-1, -0.5], [-1, 0.5], [0.5, -1], [0.5, 1], [-0.5, -1], [-0.5, 1]),
     ]
 )
-_DISTANCES = np.array([[[1.0]], [[14.0]], [[28.0]]])  # px from the marker's edge to its label
+_DISTANCES = np.array([[[4.0]], [[14.0]], [[28.0]]])  # px from the marker's edge to its label
 
 
 class Camera:

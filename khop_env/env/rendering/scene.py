@@ -14,7 +14,7 @@ from khop_env.physics import AgentModel, Fleet
 # and reddish purple kept for task edges
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#000000")
 TASK_COLOR = "#CC79A7"
-EDGE_COLOR = "#A8A8A8"
+EDGE_COLOR = "#6A6A6A"  # darker than task edges also where pink looks grey
 LEADER_COLOR = "#F0E442"
 ALARM_COLOR = "#D55E00"
 INK, SOFT, PALE = "#222222", "#666666", "#ECECEC"
