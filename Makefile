@@ -19,9 +19,10 @@ lint: .venv/dev
 bench: .venv/bench $(if $(PEERS),.peers/mpe2/done .peers/vmas/done .peers/jaxmarl/done)
 	$(BIN)/khop bench $(if $(PEERS),--peers .peers)
 
-# RLlib, TorchRL and Tianshou with the environments, each library in an environment of its own (minutes)
+# RLlib, TorchRL and Tianshou with the environments, and evaluation on Ray, each library in an environment of its own (minutes)
 integrations: .peers/rllib/done .peers/torchrl/done .peers/tianshou/done
 	for name in rllib torchrl tianshou; do .peers/$$name/bin/python examples/integrations/run_$$name.py || exit 1; done
+	.peers/rllib/bin/python examples/integrations/run_evaluation_on_ray.py
 
 .peers/rllib/done: PACKAGES = -e '.[ray]' torch
 .peers/torchrl/done: PACKAGES = -e . 'torchrl>=0.7'

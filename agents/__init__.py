@@ -1,6 +1,47 @@
-"""THE DECISIONS: observation to action. Feedback laws now; policies, training and evaluation build on them."""
+"""THE DECISIONS: observation to action. Feedback laws, policies, and their evaluation."""
 
-from agents.consensus import TanhConsensus
+from agents.comparison import Comparison, Row, compare, interval95
+from agents.consensus import LinearConsensus, TanhConsensus
+from agents.evaluation import Episodes, evaluate, play
+from agents.formation import FormationLaw
 from agents.laws import LAWS, LawError, make_law
+from agents.leader_following import LeaderFollowingLaw
+from agents.lyapunov import ComparisonGain
+from agents.policies import POLICIES, make_policy
+from agents.policy import EnvDescription, Policy, describe
+from agents.scripted import LawPolicy, RandomPolicy, ZeroPolicy
+from agents.set_iss import analytical_gain, injected_errors, swept_bounds
+from agents.tuning import Tuned, tune
+from agents.velocity_law import VelocityLaw
 
-__all__ = ["LAWS", "LawError", "TanhConsensus", "make_law"]
+__all__ = [
+    "LAWS",
+    "POLICIES",
+    "Comparison",
+    "ComparisonGain",
+    "EnvDescription",
+    "Episodes",
+    "FormationLaw",
+    "LawError",
+    "LawPolicy",
+    "LeaderFollowingLaw",
+    "LinearConsensus",
+    "Policy",
+    "RandomPolicy",
+    "Row",
+    "TanhConsensus",
+    "Tuned",
+    "VelocityLaw",
+    "ZeroPolicy",
+    "analytical_gain",
+    "compare",
+    "describe",
+    "evaluate",
+    "injected_errors",
+    "interval95",
+    "make_law",
+    "make_policy",
+    "play",
+    "swept_bounds",
+    "tune",
+]

@@ -159,7 +159,7 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
         observations, reward, terminated, truncated, infos = env.step(given)
         returns += np.where(running, reward.mean(axis=1), 0.0)
         squared = [
-            np.square(np.clip(actions[agent][:, :m], -1.0, 1.0)).sum(axis=1)
+            np.square(np.clip(actions[agent][:, :m], -1.0, 1.0, dtype=np.float64)).sum(axis=1)
             for agent, m in zip(env.agents, inputs, strict=True)
         ]
         effort += np.where(running, np.mean(squared, axis=0), 0.0)

@@ -73,7 +73,12 @@ class ComparisonGain:
             error: |d| during the step, in m.
             dt: in s.
         """
-        after = distance - dt * self.decrease(distance) + dt * self.error_weight * error
+        pushed = self.error_weight * error
+        one = pushed - self.decrease(distance)  # the classical Runge-Kutta step
+        two = pushed - self.decrease(distance + 0.5 * dt * one)
+        three = pushed - self.decrease(distance + 0.5 * dt * two)
+        four = pushed - self.decrease(distance + dt * three)
+        after = distance + dt / 6.0 * (one + 2.0 * two + 2.0 * three + four)
         largest = np.array([self.region(float(one)) for one in error.flat]).reshape(error.shape)
         return np.where(np.maximum(distance, after) <= largest, after, math.inf)
 

@@ -20,13 +20,14 @@ def _table() -> dict[str, Any]:
 def tuned_parameters(env: EnvDescription, law: str) -> dict[str, Any]:
     """The shipped parameters of a law, or none.
 
-    Those for the scenario win over those for its family ("random_geometric" for "random_geometric:agents=30"). There
-    are some for observations with estimates, which serve on the truth, too, and some for local ones.
+    Those for the scenario win over those for another member of its family ("random_geometric:..."). There are some for
+    observations with estimates, which serve on the truth, too, and some for local ones.
 
     Args:
         env: environment, scenario and observation mode.
         law: name of the law.
     """
-    scenarios = _table().get(env.environment, {})
-    laws = scenarios.get(env.scenario) or scenarios.get(env.scenario.partition(":")[0]) or {}
+    scenarios, family = _table().get(env.environment, {}), env.scenario.partition(":")[0]
+    relatives = [name for name in scenarios if name.partition(":")[0] == family]
+    laws = scenarios[env.scenario if env.scenario in scenarios else relatives[0]] if relatives else {}
     return dict(laws.get(law, {}).get("local" if env.observe == "local" else "estimate", {}))

@@ -56,8 +56,7 @@ def iss(
         for kind, disturbed in dict.fromkeys((row["observers"], row["disturbed"]) for row in swept)
         for mine in [[row for row in swept if (row["observers"], row["disturbed"]) == (kind, disturbed)]]
     ]
-    broken = [row for row in injected if row["bound"] is not None and row["distance"] > row["bound"]]
-    broken += [row for row in swept if row["holds"] is False]
+    broken = [row for row in (*injected, *swept) if row["holds"] is False]
     if as_json:
         region = None if gain is None else gain.region()
         found = {"scenario": scenario.name, "law": scenario.law.name, "analytical_region": region, "holds": not broken}

@@ -21,7 +21,8 @@ def error_over_time(
 
     Args:
         time: (T,) in s.
-        errors: (T, E) in m by (policy, observation mode): policies differ in colour, modes in dashes.
+        errors: (T, E) in m by (policy, observation mode): policies differ in colour and modes in dashes; the
+            modes of a single policy in both.
         path: of the image file.
         title: of the figure.
 
@@ -37,7 +38,8 @@ def error_over_time(
         figure = Figure(figsize=(8.4, 4.6), layout="constrained")
         axes = figure.subplots()
         for (policy, mode), values in errors.items():
-            color = COLORS[policies.index(policy) % len(COLORS)]
+            number = policies.index(policy) if len(policies) > 1 else modes.index(mode)
+            color = COLORS[number % len(COLORS)]
             low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=1)
             dashes = _DASHES[modes.index(mode) % len(_DASHES)]
             axes.plot(time, middle, color=color, linestyle=dashes, label=f"{policy} on {mode}")

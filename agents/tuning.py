@@ -1,0 +1,90 @@
+"""Tuning the scripted policies: a pattern search on the mean return over fixed episodes."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from agents.evaluation import play
+from agents.laws import LAWS
+from agents.policy import batched_of, describe
+from agents.scripted import LawPolicy
+
+SEEDS = range(10_000, 10_064)
+"""Episodes that parameters are tuned on; others than those that evaluation plays by default."""
+
+_FACTORS = (0.25, 0.5, 2**-0.5, 2**-0.25, 2**0.25, 2**0.5, 2.0, 4.0)
+_STEPS = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # of parameters from 0 to 1
+_WORTH = 1e-4  # relative improvement that a change has to bring
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The best parameters found.
+
+    Attributes:
+        parameters: by name.
+        mean_return: over the tuning episodes.
+        default_return: the law's defaults over the same.
+        trials: parameter sets played.
+    """
+
+    parameters: dict[str, Any]
+    mean_return: float
+    default_return: float
+    trials: int
+
+
+def tune(
+    env: object, law: str, seeds: Sequence[int] = SEEDS, *, progress: Callable[[float], None] | None = None
+) -> Tuned:
+    """Change one parameter after the other, as long as the mean return grows.
+
+    Positive parameters are multiplied by up to 4, those from 0 to 1 moved by up to 0.2, and switches flipped.
+
+    Args:
+        env: an environment of khop_env; its copies are played at once.
+        law: one of `LAWS`.
+        seeds: of the episodes.
+        progress: told, roughly, how far it is.
+
+    Returns:
+        Parameters to three digits. An optimum of this search need not be the global one.
+    """
+    batched = batched_of(env)
+    names = [one.name for one in fields(LAWS[law])]  # type: ignore[arg-type]
+    signature = inspect.signature(LAWS[law]).parameters
+    best = {name: signature[name].default for name in names}
+    known: dict[tuple[Any, ...], float] = {}
+
+    def value(parameters: dict[str, Any]) -> float:
+        key = tuple(parameters.values())
+        if key not in known:
+            known[key] = float(play(batched, LawPolicy(law, parameters), seeds, name=law).returns.mean())
+        return known[key]
+
+    default = top = value(best)
+    if not math.isfinite(default):
+        raise ValueError(f"{law!r} with its default parameters returns {default} in {describe(batched).environment}")
+    improved, rounds = True, 0
+    while improved and rounds < 6:
+        improved, rounds = False, rounds + 1
+        for number, name in enumerate(names):
+            for candidate in _candidates(name, best[name]):
+                found = value({**best, name: candidate})
+                if found > top + _WORTH * abs(top):
+                    best, top, improved = {**best, name: candidate}, found, True
+            if progress is not None:
+                progress(1.0 - 0.5 ** (rounds - 1 + (number + 1) / len(names)))
+    return Tuned(best, top, default, len(known))
+
+
+def _candidates(name: str, value: Any) -> list[Any]:
+    if isinstance(value, bool):
+        return [not value]
+    if name == "shrink":
+        return [round(min(1.0, max(0.0, value + step)), 2) for step in _STEPS]
+    return [float(f"{value * factor:.3g}") for factor in _FACTORS]

@@ -1,0 +1,150 @@
+"""Evaluation: what is measured, that it is paired, and that nobody who plays makes a difference."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from agents import compare, evaluate, interval95, make_policy, play
+from agents.comparison import CHUNK
+from tests.env.playing import batched, parallel
+
+
+def test_an_episode_measured_by_hand():
+    """Every number of an episode, against a loop over the ParallelEnv."""
+    env = parallel("formation_v0", "mixed_fleet", max_cycles=40)
+    episodes = play(batched("formation_v0", "mixed_fleet", num_envs=4, max_cycles=40), make_policy("linear"), range(7))
+    policy = make_policy("linear")
+    from agents import describe
+
+    policy.reset(describe(env), seeds=[5])
+    seen, infos = env.reset(seed=5)
+    errors, total, effort, worst, bound = [], 0.0, [], [], []
+    errors.append(np.mean([info["task_error"] for info in infos.values()]))
+    while env.agents:
+        actions = policy.act(seen)
+        effort.append(np.mean([np.square(actions[agent]).sum() for agent in actions]))
+        seen, rewards, _, _, infos = env.step(actions)
+        total += np.mean(list(rewards.values()))
+        errors.append(np.mean([info["task_error"] for info in infos.values()]))
+        worst.append(max(info["max_normalized_disagreement"] for info in infos.values()))
+        bound.append(max(info["max_error_to_bound"] for info in infos.values()))
+    assert episodes.seed[5] == 5
+    np.testing.assert_allclose(episodes.task_error[:, 5], errors, rtol=1e-12)
+    np.testing.assert_allclose(episodes.returns[5], total, rtol=1e-12)
+    np.testing.assert_allclose(episodes.effort[5], np.mean(effort), rtol=1e-6)
+    assert episodes.final_task_error[5] == errors[-1]
+    assert episodes.max_normalized_disagreement[5] == max(worst)
+    assert episodes.late_normalized_disagreement[5] == max(worst[10:])
+    assert episodes.max_error_to_bound[5] == max(bound)
+    outside = np.flatnonzero(np.array(errors) > 0.1 * errors[0])
+    expected = np.inf if outside[-1] == 40 else 0.05 * (outside[-1] + 1)
+    assert episodes.settling_time[5] == pytest.approx(expected)
+
+
+def test_an_early_end_ends_the_sums():
+    """With a success radius copies end at different times; what they do after that isn't counted."""
+    arguments = {"success_radius": 0.3, "max_cycles": 60}
+    together = play(batched("consensus_v0", "paper", num_envs=6, **arguments), make_policy("tanh"), range(6))
+    alone = [
+        play(batched("consensus_v0", "paper", num_envs=1, **arguments), make_policy("tanh"), [seed])
+        for seed in range(6)
+    ]
+    for seed, one in enumerate(alone):
+        assert together.returns[seed] == one.returns[0]
+        assert together.effort[seed] == one.effort[0]
+        np.testing.assert_array_equal(together.task_error[:, seed], one.task_error[:, 0])
+    assert len(np.unique(together.settling_time)) > 1
+    assert np.all(together.task_error[-1] <= 0.3)
+
+
+def test_frame_is_tidy_and_paired():
+    env = batched("leader_following_v0", "convoy", num_envs=5, max_cycles=20)
+    frame = evaluate(env, ["tanh", "zero"], range(5))
+    assert frame.columns[:6] == ["environment", "scenario", "observe", "policy", "seed", "return"]
+    assert frame.shape[0] == 10
+    assert frame["scenario"].unique().to_list() == ["convoy"]
+    assert frame.filter(frame["policy"] == "zero")["seed"].to_list() == list(range(5))
+    again = evaluate(env, {"tanh": make_policy("tanh")}, range(5))
+    assert again.equals(frame.filter(frame["policy"] == "tanh"))
+
+
+def test_the_same_numbers_whoever_plays():
+    """One process, two, and other orders: equal bits."""
+    arguments = {"scenario": "mixed_fleet", "seeds": range(CHUNK + 3), "arguments": {"max_cycles": 10}}
+    one = compare("consensus_v0", ["tanh", "random"], ("estimate", "local"), **arguments)
+    two = compare("consensus_v0", ["tanh", "random"], ("estimate", "local"), workers=2, **arguments)
+    other = compare("consensus_v0", ["random"], ("local",), **arguments)
+    assert one.summary() == two.summary()
+    assert one.frame().equals(two.frame())
+    np.testing.assert_array_equal(one.rows[3].episodes.task_error, other.rows[0].episodes.task_error)
+    assert [row.label for row in one.rows] == [f"{p} on {m}" for p in ("tanh", "random") for m in ("estimate", "local")]
+
+
+def test_episodes_of_all_rows_begin_alike():
+    compared = compare("leader_following_v0", ["tanh", "zero"], ("estimate", "oracle"), seeds=range(4))
+    starts = [row.episodes.task_error[0] for row in compared.rows]
+    assert all(np.array_equal(starts[0], one) for one in starts)
+    more, interval = compared.difference(compared.rows[2])
+    difference = compared.rows[2].episodes.returns - compared.rows[0].episodes.returns
+    assert more == difference.mean()
+    assert interval == interval95(difference)
+
+
+def test_estimates_pay_where_leaders_are_out_of_earshot():
+    """The case that the environment exists for: intervals on estimates and on neighbours only are apart."""
+    rows = compare("leader_following_v0", ["leader_following"], ("estimate", "oracle", "local"), seeds=range(50)).rows
+    estimate, oracle, local = (row.summary() for row in rows)
+    assert estimate["mean_return"] - estimate["ci95"] > local["mean_return"] + local["ci95"]
+    assert estimate["mean_return"] > 1.05 * oracle["mean_return"]
+    assert estimate["final_task_error"] < 0.5 * local["final_task_error"]
+
+
+@pytest.mark.parametrize("count", [4, 5, 10, 100])
+def test_interval_is_students(count):
+    values = np.random.default_rng(count).normal(size=count)
+    low, high = stats.t.interval(0.95, count - 1, values.mean(), stats.sem(values))
+    assert interval95(values) == pytest.approx((high - low) / 2, rel=0.01)
+    assert interval95(values[:1]) is None
+
+
+class Stubborn:
+    def __init__(self, actions):
+        self.actions = actions
+
+    def reset(self, env, seeds):
+        pass
+
+    def act(self, observations):
+        return self.actions(observations)
+
+
+@pytest.mark.parametrize(
+    ("actions", "said"),
+    [
+        (lambda seen: {}, "policy 'mine' in consensus_v0: no action for 'drifter_0'; got some for nobody"),
+        (
+            lambda seen: {agent: np.zeros((2, 3)) for agent in seen},
+            r"of 'drifter_0' must have shape \(2, 2\); got \(2, 3\)",
+        ),
+        (
+            lambda seen: {agent: np.full((2, 2), np.nan) for agent in seen},
+            "action of 'drifter_0' in copy 0 isn't finite",
+        ),
+    ],
+)
+def test_actions_that_will_not_do(actions, said):
+    with pytest.raises(ValueError, match=said):
+        evaluate(batched("consensus_v0", num_envs=2), {"mine": Stubborn(actions)}, range(2))
+
+
+def test_mistakes():
+    with pytest.raises(ValueError, match="nothing to play without seeds"):
+        compare("consensus_v0", ["tanh"], seeds=[])
+    with pytest.raises(ValueError, match="no environment 'consensus'; did you mean 'consensus_v0'"):
+        compare("consensus", ["tanh"])
+    with pytest.raises(ValueError, match="observe must be one of estimate, oracle, local; got 'orcale'"):
+        compare("consensus_v0", ["tanh"], ("orcale",))
+    with pytest.raises(ValueError, match="no policy 'than'"):
+        compare("consensus_v0", ["tanh", "than"])
+    with pytest.raises(TypeError, match="expected an environment of khop_env; got int"):
+        evaluate(3, ["tanh"], [0])

@@ -1,0 +1,101 @@
+"""`khop evaluate`, `iss` and `tune`, as their users call them."""
+
+import csv
+import io
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from khop_env.cli import app
+from khop_env.commands.evaluate import split_policies
+
+
+def khop(*arguments: str, status: int = 0):
+    result = CliRunner().invoke(app, list(arguments))
+    assert result.exit_code == status, (result.stdout, result.stderr, result.exception)
+    return result
+
+
+def test_evaluate_prints_json():
+    result = khop(
+        *("evaluate", "leader_following_v0", "--scenario", "paper", "--policies", "tanh,zero"),
+        *("--observe", "estimate,local", "--episodes", "3", "--json"),
+    )
+    found = json.loads(result.stdout)
+    assert list(found) == ["environment", "scenario", "episodes", "rows"]
+    assert (found["environment"], found["scenario"], found["episodes"]) == ("leader_following_v0", "paper", 3)
+    keys = ["policy", "observe", "mean_return", "ci95", "final_task_error", "settling_time", "effort"]
+    keys += ["max_normalized_disagreement", "max_error_to_bound"]
+    assert [list(row) for row in found["rows"]] == [keys] * 4
+    assert [(row["policy"], row["observe"]) for row in found["rows"]] == [
+        ("tanh", "estimate"),
+        ("tanh", "local"),
+        ("zero", "estimate"),
+        ("zero", "local"),
+    ]
+    assert found["rows"][3]["settling_time"] is None
+    assert result.stderr == ""
+
+
+def test_evaluate_prints_a_table_and_draws(tmp_path):
+    figure = tmp_path / "new" / "errors.png"
+    result = khop("evaluate", "consensus_v0", "--policies", "tanh,random", "--episodes", "2", "--figure", str(figure))
+    assert "consensus_v0 on paper, 2 episodes" in result.stdout
+    assert result.stdout.count("random") == 3
+    assert "±" in result.stdout
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    assert f"figure: {figure}" in result.stderr
+
+
+def test_evaluate_prints_csv():
+    result = khop("evaluate", "formation_v0", "--policies", "linear", "--observe", "local", "--episodes", "2", "--csv")
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert [row["seed"] for row in rows] == ["0", "1"]
+    assert float(rows[0]["return"]) < 0.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("consensus",), "no environment 'consensus'; did you mean 'consensus_v0'?"),
+        (("consensus_v0", "--scenario", "papr"), "no scenario 'papr'; did you mean 'paper'?"),
+        (("consensus_v0", "--policies", "thanh"), "no policy 'thanh'; did you mean 'tanh'?"),
+        (("consensus_v0", "--policies", ","), "name at least one policy"),
+        (("consensus_v0", "--policies", "zero,zero"), "--policies names 'zero' twice"),
+        (("consensus_v0", "--observe", "truth"), "observe must be one of estimate, oracle, local; got 'truth'"),
+        (("consensus_v0", "--csv", "--json"), "choose one of them"),
+    ],
+)
+def test_evaluate_refuses(arguments, said):
+    assert said in khop("evaluate", *arguments, status=2).stderr
+
+
+def test_policies_and_their_parameters_are_told_apart():
+    assert split_policies("tanh, linear:gain=2,cancel_drift=true ,zero") == [
+        "tanh",
+        "linear:gain=2,cancel_drift=true",
+        "zero",
+    ]
+
+
+def test_iss(tmp_path):
+    result = khop("iss", "paper", "--episodes", "2", "--duration", "4", "--out", str(tmp_path), "--json")
+    found = json.loads(result.stdout)
+    assert found["holds"] is True
+    assert {row["observers"] for row in found["swept"]} == {"as designed", "bare"}
+    assert all((tmp_path / name).exists() for name in ("figure.png", "injected.csv", "swept.csv"))
+    slopes = {(row["observers"], row["disturbed"]): row["slope"] for row in found["slopes"]}
+    assert slopes["bare", True] > 1.5
+    table = khop("iss", "paper", "--episodes", "1", "--duration", "1", "--out", str(tmp_path)).stdout
+    assert "analytical gain: holds for distances up to 0.656 m; no run exceeds it" in table
+    assert "slope of log excess with disturbance" in table
+
+
+def test_tune():
+    result = khop("tune", "consensus_v0", "--policies", "tanh", "--observe", "estimate")
+    assert result.stdout.startswith("# Found by khop tune consensus_v0, on 64 episodes")
+    assert '[consensus_v0."paper".tanh]\nestimate = { gain = ' in result.stdout
+    assert "tanh on estimate: -" in result.stderr
+    assert "name one environment" in khop("tune", status=2).stderr
+    assert "no law 'tan'" in khop("tune", "consensus_v0", "--policies", "tan", status=2).stderr
