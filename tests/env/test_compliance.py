@@ -6,8 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
-from playing import CROSS, EVERY, IDS, aec, joint, parallel
+from playing import CROSS, IDS, aec, built, joint, parallel
 from stable_baselines3.common.env_checker import check_env as sb3_check
+
+from khop_env.env.rendering import canvas
 
 with warnings.catch_warnings():  # the import makes example environments in a way that PettingZoo itself deprecates
     warnings.filterwarnings("ignore", "The old environment creation API", DeprecationWarning)
@@ -25,6 +27,14 @@ FOREIGN_OPTION = "ignore:reset\\(\\) ignores the option 'options':UserWarning"  
 RAGGED = "ignore:(Agents have different observation space sizes|Observations are different shapes):UserWarning"
 # padding is always zero
 PADDING = "ignore:(.*A Box observation space|Agent's) maximum and minimum .*values are equal:UserWarning"
+
+
+@pytest.fixture
+def no_screen(monkeypatch):
+    """A window that isn't there, and doesn't wait for its 25 frames a second."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr(canvas, "FRAMES_PER_SECOND", 0)
+
 
 cross = pytest.mark.parametrize(("environment", "name", "observe", "uniform"), CROSS)
 
@@ -54,34 +64,24 @@ def test_state(environment, name, observe, uniform):
     state_test(aec(environment, name, **arguments), parallel(environment, name, **arguments), num_cycles=3)
 
 
-@pytest.mark.parametrize(("environment", "name"), EVERY)
-def test_max_cycles(environment, name):
-    max_cycles_test(
-        SimpleNamespace(parallel_env=partial(parallel, environment, name), env=partial(aec, environment, name))
-    )
+@cross
+def test_max_cycles(environment, name, observe, uniform):
+    made = [partial(make, environment, name, observe=observe, uniform=uniform) for make in (parallel, aec)]
+    max_cycles_test(SimpleNamespace(parallel_env=made[0], env=made[1]))
+
+
+@cross
+def test_rendering(environment, name, observe, uniform, no_screen):
+    """Both modes, to a window that isn't there."""
+    render_test(partial(aec, environment, name, observe=observe, uniform=uniform))
 
 
 @pytest.mark.filterwarnings(PADDING)
-@pytest.mark.parametrize("uniform", [True, False])
-@pytest.mark.parametrize(("environment", "name"), EVERY)
-def test_centralised_view(environment, name, uniform):
-    env = joint(IDS[environment], scenario=name, uniform=uniform, max_cycles=5)
-    gymnasium_check(env.unwrapped, skip_render_check=True)
-    sb3_check(env, skip_render_check=True)
-
-
-@pytest.mark.parametrize(("environment", "name"), EVERY)
-def test_rendering(environment, name, monkeypatch):
-    """Both modes, to a window that isn't there."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    render_test(partial(aec, environment, name))
-
-
-@pytest.mark.parametrize("environment", IDS)
-def test_centralised_view_with_frames(environment, monkeypatch):
-    """Gymnasium's and SB3's checks of render(), too."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = joint(IDS[environment], scenario="convoy", max_cycles=3, render_mode="rgb_array")
+@cross
+def test_centralised_view(environment, name, observe, uniform, no_screen):
+    """Gymnasium's and SB3's checks, those of render() included."""
+    arguments = {"scenario": built(name), "observe": observe, "uniform": uniform, "max_cycles": 3}
+    env = joint(IDS[environment], **arguments, render_mode="rgb_array")
     gymnasium_check(env.unwrapped)
     sb3_check(env)
     env.close()
