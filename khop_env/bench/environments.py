@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from khop_env import consensus_v0
-from khop_env.env import BatchedEnv
+from khop_env.env import BatchedEnv, KHopEnv, Settings
 
 BATCH = 1024
 PEERS = Path(__file__).parent / "peers"
@@ -23,9 +23,9 @@ Rate = Callable[[float], float]
 """Agent-steps per second, measured for about so many seconds."""
 
 
-def single_rate(seconds: float, order: int = 1) -> float:
-    """Agent-steps per second of one `consensus_v0.parallel_env` on `paper`, random actions, episodes of 200 steps."""
-    env = consensus_v0.parallel_env(order=order)
+def single(scenario: str, order: int) -> tuple[KHopEnv, Callable[[int], None]]:
+    """One `consensus_v0.parallel_env`, and a step with random actions that resets it after 200."""
+    env = consensus_v0.parallel_env(scenario, order=order)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     pool = [{agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.possible_agents} for _ in range(64)]
@@ -35,6 +35,12 @@ def single_rate(seconds: float, order: int = 1) -> float:
         if not env.agents:
             env.reset()
 
+    return env, step
+
+
+def single_rate(seconds: float, scenario: str, order: int) -> float:
+    """Agent-steps per second of one `consensus_v0.parallel_env`, resets, observations and dictionaries included."""
+    env, step = single(scenario, order)
     return len(env.possible_agents) * _calls_per_second(step, seconds)
 
 
@@ -60,9 +66,8 @@ def vector_rate(seconds: float, scenario: str, order: int, threads: int, batch: 
     return batch * len(env.agents) * _calls_per_second(step, seconds)
 
 
-def shares(scenario: str, order: int, batch: int, steps: int) -> dict[str, float]:
-    """Microseconds per copy and step spent in each part of `BatchedEnv.step`, random actions."""
-    env, step = batched(scenario, order, 1, batch)
+def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str, float]:
+    """Microseconds per copy and step spent in each part of `step`, which steps `env`."""
     for number in range(5):
         step(number)
     simulator: Any = env.simulator
@@ -80,7 +85,7 @@ def shares(scenario: str, order: int, batch: int, steps: int) -> dict[str, float
         step(number)
     total = time.perf_counter() - start
     spent["rest, Python and NumPy"] = total - sum(spent.values())
-    return {name: seconds / (steps * batch) * 1e6 for name, seconds in spent.items()}
+    return {name: seconds / (steps * env.batch) * 1e6 for name, seconds in spent.items()}
 
 
 def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str], None], peers: Path | None) -> None:
@@ -93,15 +98,21 @@ def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str],
         peers: folder with one virtual environment per peer, named mpe2, vmas, jaxmarl; None to leave them out.
     """
     seconds, batch = (0.05, 64) if quick else (1.0, BATCH)
-    say(f"environments: where a step of {batch} copies spends its time")
+    settings = Settings()  # the defaults, which all rows have but for the order and the threads that they name
+    add("environment_control_period", settings.control_period, "s between actions, in all rows below")
+    add("environment_substeps", settings.substeps, "simulator steps in a control period")
     for scenario in ("paper", "convoy"):
-        for name, value in shares(scenario, 1, batch, 3 if quick else 60).items():
-            add(f"{scenario}: {name}", value, "us per copy and step")
+        say(f"environments: where a step spends its time on {scenario}, one copy and {batch}")
+        one, step_one = single(scenario, 1)
+        many, step_many = batched(scenario, 1, 1, batch)
+        for kind, env, step, steps in (("single", one.batched, step_one, 3000), ("vector", many, step_many, 60)):
+            for part, value in shares(env, step, 3 if quick else steps).items():
+                add(f"{kind}_{scenario}: {part}", value, "us per copy and step")
 
     def ours(scenario: str, order: int, threads: int) -> Rate:
         return lambda s: vector_rate(s, scenario, order, threads, batch)
 
-    several = f"VMAS simple_spread, batch {batch}"
+    vmas = f"VMAS simple_spread, batch {batch}"
     plan: list[tuple[str, str, Rate, str, int, int, str]] = [
         (f"single_order{order}", "MPE2 simple_spread", _single(order), "mpe2", 1, 1, "at least 8" if order == 1 else "")
         for order in (1, 2)
@@ -109,11 +120,9 @@ def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str],
     for scenario in ("paper", "convoy"):
         for order in (1, 2):
             wanted = "at least 2" if order == 1 else ""
-            plan.append(
-                (f"vector_{scenario}_order{order}", several, ours(scenario, order, 1), "vmas", batch, 1, wanted)
-            )
-        plan.append((f"vector_{scenario}_threads2", several, ours(scenario, 1, 2), "vmas", batch, 2, ""))
-        name = f"JaxMARL simple_spread, batch {batch}, a step a call"
+            plan.append((f"vector_{scenario}_order{order}", vmas, ours(scenario, order, 1), "vmas", batch, 1, wanted))
+        plan.append((f"vector_{scenario}_threads2", vmas, ours(scenario, 1, 2), "vmas", batch, 2, ""))
+        name = f"JaxMARL simple_spread, batch {batch}, a step a call: our one thread against XLA's own pool"
         plan.append((f"vector_{scenario}_jax", name, ours(scenario, 1, 1), "jaxmarl", batch, 1, "aim 1"))
     for name, peer_name, rate, peer, size, threads, target in plan:
         say(f"environments: {name}")
@@ -130,7 +139,7 @@ def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str],
 
 
 def _single(order: int) -> Rate:
-    return lambda seconds: single_rate(seconds, order)
+    return lambda seconds: single_rate(seconds, "paper", order)
 
 
 def _peer_rate(python: Path, peer: str, batch: int, threads: int, seconds: float) -> float:
