@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import get_type_hints
 
 from agents.laws import LAWS
+from agents.learning.config import ALGORITHMS
+from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import Policy
 from agents.scripted import LawPolicy, RandomPolicy, ZeroPolicy
 from khop_env.physics import did_you_mean
@@ -20,16 +22,22 @@ def make_policy(spec: str) -> Policy:
         make_policy("tanh")                  # tuned where there are tuned parameters, otherwise the defaults
         make_policy("linear:gain=2,cancel_drift=true")
         make_policy("zero")
+        make_policy("ppo:runs/mine")         # what khop train learned: its folder, or one of the .npz files in it
+        make_policy("ppo:pretrained")        # shipped with the library, for some environments and scenarios
 
     Raises:
-        ValueError: for an unknown name or parameter, naming the nearest, or a wrong value.
+        ValueError: for an unknown name or parameter, naming the nearest, a wrong value, or a file that isn't a policy.
     """
     name, _, given = spec.partition(":")
+    if name in ALGORITHMS:
+        if not given:
+            raise ValueError(f"policy {spec!r}: say which, {name}:FOLDER or {name}:pretrained")
+        return PretrainedPolicy() if given == "pretrained" else LearnedPolicy.load(given)
     if name in LAWS:
         parameters = parameters_from_text(given, get_type_hints(LAWS[name]), f"policy {spec!r}")
         return LawPolicy(name, parameters)
     if name not in POLICIES:
-        raise ValueError(f"no policy {name!r}; {did_you_mean(name, POLICIES)}")
+        raise ValueError(f"no policy {name!r}; {did_you_mean(name, (*POLICIES, *ALGORITHMS))}")
     if given:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
     return ZeroPolicy() if name == "zero" else RandomPolicy()

@@ -19,6 +19,7 @@ from khop_env.commands.evaluate import evaluate
 from khop_env.commands.iss import iss
 from khop_env.commands.run import run
 from khop_env.commands.scenarios import check, export, list_scenarios
+from khop_env.commands.train import train
 from khop_env.commands.tune import tune
 from khop_env.terminal import say
 
@@ -37,6 +38,7 @@ app.command()(check)
 app.command()(run)
 app.command()(export)
 app.command()(evaluate)
+app.command()(train)
 app.command()(tune)
 app.command()(iss)
 app.command()(bench)

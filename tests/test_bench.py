@@ -46,6 +46,8 @@ def test_every_promised_figure_is_printed():
         "ratio_to_floor",
         "growth_time",
         "growth_memory",
+        "training",
+        "training_environment_share",
     } <= set(rows)
     assert PARTS | RATES | {"environment_control_period", "environment_substeps"} <= set(rows)
     assert (rows["environment_control_period"], rows["environment_substeps"]) == (0.05, 1)

@@ -30,7 +30,7 @@ RANKS = [
 HEAVY = {
     "torch": ("agents", "khop_env.bench.peers"),  # the peers run in environments of their own
     "ray": ("agents",),
-    "stable_baselines3": ("agents", "khop_env.env.sb3"),
+    "stable_baselines3": ("agents", "khop_env.env.sb3", "khop_env.bench.peers"),
     "matplotlib": ("khop_env.results", "khop_env.env.rendering"),
     "pygame": ("khop_env.env.rendering",),
     "imageio_ffmpeg": ("khop_env.results",),

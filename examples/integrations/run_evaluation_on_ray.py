@@ -12,4 +12,6 @@ here = compare("consensus_v0", **arguments)
 there = compare("consensus_v0", **arguments, ray=True)
 assert here.summary() == there.summary()
 assert here.frame().equals(there.frame())
-print("on Ray as on one machine:", *(f"{row.label} {row.episodes.returns.mean():.3f}" for row in there.rows), sep="\n  ")
+print("on Ray as on one machine:")
+for row in there.rows:
+    print(f"  {row.label} {row.episodes.returns.mean():.3f}")

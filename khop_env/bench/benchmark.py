@@ -20,6 +20,7 @@ import numpy as np
 
 from agents import make_law
 from khop_env.bench.environments import environment_rows
+from khop_env.bench.training import training_rows
 from khop_env.bench.yardsticks import CompiledPaper, bare_loop
 from khop_env.observers import FloatArray
 from khop_env.scenarios import Scenario, paper, random_geometric
@@ -59,6 +60,7 @@ def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path
     add("ratio_to_floor", _ratio_to_floor(quick), target="at most 6")
     _growth(add, quick, say)
     environment_rows(add, quick, say, peers)
+    training_rows(add, quick, say, peers)
     return {"machine": _machine(), "rows": rows}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,7 @@ from khop_env.commands.common import (
 from khop_env.terminal import Progress, say, waiting
 
 if TYPE_CHECKING:
+    from khop_env.env import Task
     from khop_env.results import Recording
     from khop_env.scenarios import LawChoice, Scenario
 
@@ -42,7 +43,9 @@ class OrderOption(enum.StrEnum):
 
 def run(
     name: ScenarioArgument,
-    controller: Annotated[str | None, typer.Option(help="Feedback law; by default the scenario's.")] = None,
+    controller: Annotated[
+        str | None, typer.Option(help="Feedback law, by default the scenario's; or a learned policy, ppo:FOLDER.")
+    ] = None,
     observe: Annotated[
         ObserveOption, typer.Option(help="What the law sees of agents out of earshot.")
     ] = ObserveOption.ESTIMATE,
@@ -67,23 +70,40 @@ def run(
     Exits with 1 if a funnel was left. Whatever was computed until then is written all the same.
     """
     from agents import make_law
+    from agents.learning import ALGORITHMS
+    from agents.running import policy_run
     from khop_env.results import RunFileError, record, summarize, write_run
     from khop_env.simulation import Explicit, Proximal
 
     explicit = integrator is IntegratorOption.EXPLICIT
     with mistakes(name), waiting(f"designing the observers of {name}"):
         scenario = load(name)
-        law = _law(scenario, controller)
+        learned = controller is not None and controller.partition(":")[0] in ALGORITHMS
+        if learned:
+            for option, value in (("--dt", dt), ("--order", order), ("--integrator", explicit or None)):
+                if value is not None:
+                    raise ValueError(f"{option}: a learned policy acts in its environment, which chooses its own steps")
         if explicit and order is OrderOption.TWO:
             raise ValueError("--order 2: the explicit integrator is forward Euler, of order 1; leave --order out")
-        stepper = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
-        dt = dt if dt is not None else EXPLICIT_STEP if explicit else scenario.dt
         duration = scenario.duration if duration is None else duration
+        dt = dt if dt is not None else EXPLICIT_STEP if explicit else scenario.dt
         for option, value in (("--duration", duration), ("--dt", dt)):
             if not 0.0 < value < float("inf"):
                 raise ValueError(f"{option} must be positive and finite; got {value!r}")
-        simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
-        simulator.reset(seed)
+        simulator: Any
+        if learned:
+            simulator = policy_run(str(controller), scenario, observe.value, duration, seed)
+            task, dt, stepper = (
+                simulator.env.batched.task,
+                simulator.env.batched.settings.control_period,
+                simulator.integrator,
+            )
+        else:
+            law = _law(scenario, controller)
+            controller, task = law.name, None
+            stepper = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
+            simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
+            simulator.reset(seed)
         shown = _film(video, observer, scenario)
         folder = out or Path("runs") / folder_name(scenario.name)
         folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost
@@ -95,7 +115,7 @@ def run(
         seed=seed,
         dt=dt,
         integrator=stepper,
-        controller=law.name,
+        controller=str(controller),
         observe=observe.value,
     )
     unwritten: RunFileError | None = None
@@ -104,7 +124,7 @@ def run(
             files = write_run(recording, scenario, summary, folder)
         except RunFileError as error:
             files, unwritten = error.written, error
-    unfilmed = None if video is None else _write_video(recording, scenario, video, shown, files)
+    unfilmed = None if video is None else _write_video(recording, scenario, task, video, shown, files)
     if as_json:
         print_json({**summary, "files": {key: str(path) for key, path in files.items()}})
     else:
@@ -150,14 +170,19 @@ def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int |
 
 
 def _write_video(
-    recording: Recording, scenario: Scenario, path: Path, observer: int | None, files: dict[str, Path]
+    recording: Recording,
+    scenario: Scenario,
+    task: Task | None,
+    path: Path,
+    observer: int | None,
+    files: dict[str, Path],
 ) -> str | None:
     """Write the film and add it to `files`; or what went wrong, which must not cost the run its other results."""
     from khop_env.results.video import write_video
 
     try:
         with Progress(f"filming {scenario.name}") as progress:
-            files["video"] = write_video(recording, scenario, path, observer=observer, progress=progress)
+            files["video"] = write_video(recording, scenario, path, observer=observer, task=task, progress=progress)
     except Exception as error:
         return f"couldn't write {path} ({str(error) or type(error).__name__})"
     return None

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from khop_env.env.batched import BatchedEnv
 from khop_env.env.layout import Float32Array
 from khop_env.env.options import initial_states
+from khop_env.env.state import Infos
 from khop_env.env.vector import require_uniform, single_spaces
 
 
@@ -27,6 +28,7 @@ class KHopSB3VecEnv(VecEnv):
 
     Attributes:
         batched: the environment as arrays (B, N, ...).
+        infos: of the last step, as arrays (B, N), before copies that ended were reset.
 
     Raises:
         ValueError: for ragged observations.
@@ -35,6 +37,7 @@ class KHopSB3VecEnv(VecEnv):
     def __init__(self, batched: BatchedEnv) -> None:
         require_uniform(batched, "a Stable-Baselines3 VecEnv")
         self.batched = batched
+        self.infos: Infos = {}
         self._actions: NDArray[Any] = np.zeros(0)
         super().__init__(batched.batch * len(batched.agents), *single_spaces(batched))
 
@@ -66,6 +69,7 @@ class KHopSB3VecEnv(VecEnv):
         if given.shape != shape:
             raise ValueError(f"actions must have shape {shape}; got {given.shape}")
         observations, reward, terminated, truncated, infos = batched.step(given.reshape(batched.batch, agents, -1))
+        self.infos = infos
         over = terminated | truncated
         described: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if over.any():

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.env import Task, consensus
 from khop_env.results.metrics import consensus_error
 from khop_env.results.recording import ObserverRecord, Progress, Recording
 from khop_env.scenarios import Scenario
@@ -53,6 +54,7 @@ def write_video(
     path: str | Path,
     *,
     observer: str | int | None = None,
+    task: Task | None = None,
     fps: int = 25,
     speed: float = 1.0,
     progress: Progress | None = None,
@@ -68,6 +70,7 @@ def write_video(
         path: of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
         observer: id or index of the agent whose beliefs are shown; by default the one with most task edges to agents
             that it can't hear.
+        task: of the environment that was run; by default agreement along the scenario's task graph.
         fps: frames per second, up to 50.
         speed: seconds of the run per second of the film.
         progress: told now and then how far it is.
@@ -87,14 +90,18 @@ def write_video(
     if not (1 <= fps <= 50 and 0.0 < speed < np.inf):
         raise ValueError(f"expected fps from 1 to 50 and a positive, finite speed; got fps={fps!r}, speed={speed!r}")
     shown = None if observer is None else recording.fleet.agent(observer)
-    edges = np.array([*scenario.task.edges, *((j, i) for i, j in scenario.task.edges)], np.int64).reshape(-1, 2)
-    renderer = Renderer(recording.design, edges, observer=shown, title=scenario.name, size=SIZES[path.suffix.lower()])
+    title = scenario.name if task is None else f"{task.name} on {scenario.name}"
+    edges, leaders = (
+        (consensus(recording.fleet, scenario.task).edges, ()) if task is None else (task.edges, task.leaders)
+    )
+    size = SIZES[path.suffix.lower()]
+    renderer = Renderer(recording.design, edges, leaders=leaders, observer=shown, title=title, size=size)
     samples = _samples(recording, fps / speed)
-    frames = _frames(renderer, recording, samples, progress)
+    frames = _frames(renderer, recording, task, samples, progress)
     try:
         if path.suffix.lower() == ".gif":
             first, middle, last = samples[0], samples[len(samples) // 2], samples[-1]
-            _write_gif(path, frames, fps, np.vstack([*_frames(renderer, recording, [first, middle, last])]))
+            _write_gif(path, frames, fps, np.vstack([*_frames(renderer, recording, task, [first, middle, last])]))
         else:
             _write_mp4(path, frames, fps)
     except BaseException:
@@ -114,14 +121,29 @@ def _samples(recording: Recording, per_second: float) -> list[int]:
 
 
 def _frames(
-    renderer: Renderer, recording: Recording, samples: Sequence[int], progress: Progress | None = None
+    renderer: Renderer,
+    recording: Recording,
+    task: Task | None,
+    samples: Sequence[int],
+    progress: Progress | None = None,
 ) -> Iterator[NDArray[np.uint8]]:
     for number, k in enumerate(samples):
         largest = max(_largest_ratio(kind, k) for kind in (recording.states, recording.inputs))
-        error = float(consensus_error(recording.fleet, recording.x[k]))
+        error = float(
+            consensus_error(recording.fleet, recording.x[k]) if task is None else _task_error(recording, task, k)
+        )
         yield renderer.frame(float(recording.time[k]), recording.x[k], recording.states.estimate[k], largest, error)
         if progress is not None:
             progress((number + 1) / len(samples))
+
+
+def _task_error(recording: Recording, task: Task | None, sample: int) -> float:
+    """Mean over agents of the root mean square error along their task edges in one sample, in m; or of agreement."""
+    if task is None:
+        return float(consensus_error(recording.fleet, recording.x[sample]))
+    positions, (own, other) = recording.fleet.positions(recording.x[sample]), task.edges.T
+    misses = ((positions[other] - positions[own] - task.displacement) ** 2).sum(axis=1)
+    return float(np.mean([np.sqrt(misses[own == i].mean()) for i in np.unique(own)]))
 
 
 def _largest_ratio(kind: ObserverRecord, sample: int) -> float:

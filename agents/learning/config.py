@@ -1,0 +1,96 @@
+"""What a training run is made of."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from khop_env.simulation import OBSERVE, Observe
+
+Algorithm = Literal["ppo", "sac"]
+ALGORITHMS = ("ppo", "sac")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Every choice of a training run; the defaults are those that worked on every task of the library.
+
+    Attributes:
+        environment: one of `khop_env.environments()`.
+        scenario: name or path; None for the environment's own.
+        observe: "estimate", "oracle" or "local".
+        bounds: whether observations hold the guaranteed bounds.
+        rates: whether networks are shown how fast positions change, as differences of observations.
+        algorithm: "ppo" or "sac".
+        per_type: a network for each type of agent instead of one for all.
+        timesteps: agent-steps, over all environments.
+        seed: of networks, environments and exploration.
+        num_envs: copies of the environment, each of N agents.
+        hidden: widths of the networks' layers.
+        learning_rate: at the beginning; falls linearly to 0 with "ppo".
+        gamma: discount per control period.
+        gae_lambda: of the advantage estimates; PPO.
+        n_steps: control periods between updates; PPO.
+        batch_size: samples in a gradient step.
+        n_epochs: passes over the samples of an update; PPO.
+        clip_range: PPO.
+        entropy: weight of the entropy bonus; PPO.
+        log_std: logarithm of the initial standard deviation of actions; PPO.
+        huber: task error in m from which the training reward is linear in it; evaluation stays quadratic.
+        evaluations: how often the policy is evaluated on fixed seeds, and saved.
+
+    Raises:
+        ValueError: naming the attribute, what was given and what is expected.
+    """
+
+    environment: str
+    scenario: str | None = None
+    observe: Observe = "estimate"
+    bounds: bool = False
+    rates: bool = True
+    algorithm: Algorithm = "ppo"
+    per_type: bool = False
+    timesteps: int = 2_000_000
+    seed: int = 0
+    num_envs: int = 64
+    hidden: tuple[int, ...] = (64, 64)
+    learning_rate: float = 2e-3
+    gamma: float = 0.95
+    gae_lambda: float = 0.9
+    n_steps: int = 8
+    batch_size: int = 1024
+    n_epochs: int = 8
+    clip_range: float = 0.2
+    entropy: float = 0.02
+    log_std: float = 0.5
+    huber: float = 1.0
+    evaluations: int = 20
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        if self.algorithm not in ALGORITHMS:
+            raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
+        if self.observe not in OBSERVE:
+            raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
+        if self.per_type and self.algorithm == "sac":
+            raise ValueError("per_type is for 'ppo'; 'sac' trains one network for all agents")
+        for name in ("timesteps", "num_envs", "n_steps", "batch_size", "n_epochs", "evaluations"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a positive integer; got {value!r}")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f"seed must be an integer that isn't negative; got {self.seed!r}")
+        if not self.hidden or not all(isinstance(width, int) and width > 0 for width in self.hidden):
+            raise ValueError(f"hidden must be the widths of at least one layer; got {self.hidden!r}")
+        for name in ("learning_rate", "clip_range", "huber"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)!r}")
+        for name in ("gamma", "gae_lambda"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be from 0 to 1; got {getattr(self, name)!r}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {**dataclasses.asdict(self), "hidden": list(self.hidden)}

@@ -1,0 +1,212 @@
+"""A learned policy: networks in plain NumPy, so that acting needs neither torch nor Stable-Baselines3."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.learning.scaling import ObservationScaler
+from agents.policy import EnvDescription, Observations
+from khop_env.env.layout import Float32Array
+
+FORMAT = 1
+_SCALER = ("scale", "valid", "moving", "rate")
+PRETRAINED = Path(__file__).with_name("pretrained")
+
+Layers = tuple[tuple[Float32Array, Float32Array], ...]
+"""(weight (out, in), bias (out,)) of each layer; ReLU between them."""
+
+
+class PolicyFileError(ValueError):
+    """A policy that can't be read, or doesn't fit; the message says which file and what is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPolicy:
+    """Networks that map features of observations to actions; deterministic, with a memory of one observation at most.
+
+    Attributes:
+        environment: what it was trained for.
+        columns: names of the observation's columns.
+        action_size: entries of an action.
+        squash: whether the outputs pass through tanh (SAC) or are cut off at 1 (PPO).
+        networks: layers by agent type; the same under "" for all types.
+        scaler: applied first.
+        about: how it was trained.
+    """
+
+    environment: str
+    columns: tuple[str, ...]
+    action_size: int
+    squash: bool
+    networks: Mapping[str, Layers]
+    scaler: ObservationScaler
+    about: Mapping[str, Any]
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Check that it was trained for this environment's observations and actions.
+
+        Raises:
+            PolicyFileError: saying what differs.
+        """
+        if env.environment != self.environment:
+            raise PolicyFileError(f"it was trained for {self.environment}, not for {env.environment}")
+        sizes, columns = set(env.action_sizes.values()), columns_of(env)
+        if len({len(layout) for layout in env.layouts.values()}) > 1 or sizes != {self.action_size}:
+            raise PolicyFileError(
+                f"it needs uniform observations and {self.action_size} entries per action; the environment has "
+                f"{sorted({len(layout) for layout in env.layouts.values()})} columns and {sorted(sizes)} entries"
+            )
+        if columns != self.columns:
+            where = self.about.get("scenario", "another scenario")
+            pairs = enumerate(zip(self.columns, columns, strict=False))
+            differs = next(
+                (f"column {q} is {mine!r} there and {its!r} here" for q, (mine, its) in pairs if mine != its),
+                "the first columns agree",
+            )
+            raise PolicyFileError(
+                f"it was trained on {where} with {len(self.columns)} columns of observations, here are {len(columns)}: "
+                f"{differs}; train one for this environment, or make it with the same scenario and bounds"
+            )
+        types = {model.type for model in env.models.values()}
+        if "" not in self.networks and (missing := types - set(self.networks)):
+            raise PolicyFileError(f"it has no network for agents of type {', '.join(sorted(missing))}")
+        object.__setattr__(self, "_types", {agent: model.type for agent, model in env.models.items()})
+        object.__setattr__(self, "_before", None)
+
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        """The networks' outputs, in [-1, 1]."""
+        seen = np.stack([observations[agent] for agent in observations])
+        features = self.scaler(seen, self._before)  # type: ignore[attr-defined]
+        object.__setattr__(self, "_before", seen)
+        if "" in self.networks:
+            return dict(zip(observations, self._forward(features, self.networks[""]), strict=True))
+        types: dict[str, str] = self._types  # type: ignore[attr-defined]
+        return {
+            agent: self._forward(mine, self.networks[types[agent]])
+            for agent, mine in zip(observations, features, strict=True)
+        }
+
+    def _forward(self, values: Float32Array, layers: Layers) -> Float32Array:
+        for number, (weight, bias) in enumerate(layers):
+            values = values @ weight.T + bias
+            if number < len(layers) - 1:
+                np.maximum(values, 0.0, out=values)
+        return np.tanh(values) if self.squash else np.clip(values, -1.0, 1.0)
+
+    def save(self, path: Path) -> None:
+        """Write everything into one .npz file."""
+        meta = {
+            "format": FORMAT,
+            "environment": self.environment,
+            "columns": list(self.columns),
+            "action_size": self.action_size,
+            "squash": self.squash,
+            "types": list(self.networks),
+            "layers": {kind: len(layers) for kind, layers in self.networks.items()},
+            "about": dict(self.about),
+        }
+        arrays: dict[str, Any] = {name: getattr(self.scaler, name) for name in _SCALER}
+        for kind, layers in self.networks.items():
+            for number, (weight, bias) in enumerate(layers):
+                arrays[f"{kind}/{number}/weight"], arrays[f"{kind}/{number}/bias"] = weight, bias
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.part.npz")
+        np.savez_compressed(partial, meta=np.array(json.dumps(meta)), **arrays)
+        partial.replace(path)  # a reader, or a kill, never finds half a file
+
+    @classmethod
+    def load(cls, path: str | Path) -> LearnedPolicy:
+        """Read a policy that `save` wrote.
+
+        Args:
+            path: the file, or the folder of a training run, whose best policy is meant then.
+
+        Raises:
+            PolicyFileError: if there is none, or it isn't one.
+        """
+        path = Path(path)
+        if path.is_dir():
+            path = path / "best.npz"
+        if not path.exists():
+            raise PolicyFileError(f"there is no policy {path}; khop train writes a folder with best.npz and last.npz")
+        try:
+            with np.load(path) as stored:
+                meta = json.loads(str(stored["meta"]))
+                if meta["format"] != FORMAT:
+                    raise PolicyFileError(f"{path}: its format is {meta['format']}, this version reads {FORMAT}")
+                networks = {
+                    kind: tuple((stored[f"{kind}/{q}/weight"], stored[f"{kind}/{q}/bias"]) for q in range(count))
+                    for kind, count in meta["layers"].items()
+                }
+                scaler = ObservationScaler(stored["scale"], stored["valid"], stored["moving"], float(stored["rate"]))
+        except PolicyFileError:
+            raise
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise PolicyFileError(f"{path} isn't a policy that khop train wrote ({error})") from error
+        return cls(
+            meta["environment"],
+            tuple(meta["columns"]),
+            meta["action_size"],
+            meta["squash"],
+            networks,
+            scaler,
+            meta["about"],
+        )
+
+
+class PretrainedPolicy:
+    """The shipped policy for an environment and scenario, found when it is known which these are."""
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Load it.
+
+        Raises:
+            PolicyFileError: if none is shipped for this environment and scenario, or it doesn't fit.
+        """
+        stem = pretrained_name(env.environment, env.scenario)
+        path = PRETRAINED / f"{stem}.npz"
+        if not path.exists():
+            raise PolicyFileError(
+                f"no pretrained policy for {env.environment} on {env.scenario}; there are: {_shipped()}. "
+                f"Train one: khop train {env.environment} --scenario {env.scenario}"
+            )
+        self._policy = LearnedPolicy.load(path)
+        self._policy.reset(env, seeds)
+
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        """Its actions."""
+        return self._policy.act(observations)
+
+
+def pretrained_name(environment: str, scenario: str) -> str:
+    """File name, without ending, of the shipped policy."""
+    return f"{environment}@{scenario.replace(':', '-').replace(',', '-').replace('=', '')}"
+
+
+def pretrained_for(scenario: str) -> Mapping[str, Any]:
+    """How the first shipped policy for a scenario was trained.
+
+    Raises:
+        PolicyFileError: if none is shipped for it.
+    """
+    ending = pretrained_name("", scenario)
+    for path in sorted(PRETRAINED.glob("*.npz"), reverse=True):  # leader following first
+        if path.stem.endswith(ending):
+            return LearnedPolicy.load(path).about
+    raise PolicyFileError(f"no pretrained policy for {scenario}; there are: {_shipped()}")
+
+
+def _shipped() -> str:
+    return ", ".join(sorted(one.stem.replace("@", " on ") for one in PRETRAINED.glob("*.npz"))) or "none"
+
+
+def columns_of(env: EnvDescription) -> tuple[str, ...]:
+    """Names of the columns of uniform observations: those of the agent with most slots."""
+    return max(env.layouts.values(), key=lambda layout: len(layout.slots)).names

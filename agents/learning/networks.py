@@ -1,0 +1,210 @@
+"""Stable-Baselines3 models of a training run, and their actors as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+
+from agents.learning.config import TrainingConfig
+from agents.learning.learned import Layers, LearnedPolicy
+from agents.learning.scaling import ObservationScaler
+
+
+class PerTypeExtractor(nn.Module):
+    """A network for each type of agent, chosen by the type's one-hot in the observation.
+
+    Each type's features stand in a block of their own, with a constant 1, and are zero elsewhere, so that the linear
+    heads which Stable-Baselines3 puts on top are separate for each type, biases included.
+
+    Args:
+        features: entries of an observation.
+        hidden: widths of the layers.
+        types: columns of the one-hot.
+    """
+
+    def __init__(self, features: int, hidden: Sequence[int], types: Sequence[int]) -> None:
+        super().__init__()
+        self.types = list(types)
+        self.actors = nn.ModuleList(_mlp(features, hidden) for _ in types)
+        self.critics = nn.ModuleList(_mlp(features, hidden) for _ in types)
+        self.latent_dim_pi = self.latent_dim_vf = len(self.types) * (hidden[-1] + 1)
+
+    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Latent features of actor and critic."""
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+        """Those of the actor."""
+        return self._blocks(self.actors, features)
+
+    def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
+        """Those of the critic."""
+        return self._blocks(self.critics, features)
+
+    def _blocks(self, networks: nn.ModuleList, features: torch.Tensor) -> torch.Tensor:
+        one = torch.ones_like(features[:, :1])
+        blocks = [
+            features[:, [column]] * torch.cat([network(features), one], dim=1)
+            for column, network in zip(self.types, networks, strict=True)
+        ]
+        return torch.cat(blocks, dim=1)
+
+
+class PerTypePolicy(ActorCriticPolicy):
+    """PPO's policy with a network for each type of agent.
+
+    Args:
+        arguments: Stable-Baselines3's own.
+        types: columns of the one-hot.
+        hidden: widths of the layers.
+        keywords: Stable-Baselines3's own.
+    """
+
+    def __init__(self, *arguments: Any, types: Sequence[int], hidden: Sequence[int], **keywords: Any) -> None:
+        self._types, self._hidden = list(types), list(hidden)
+        super().__init__(*arguments, **keywords)
+
+    def _build_mlp_extractor(self) -> None:
+        self.mlp_extractor = PerTypeExtractor(self.features_dim, self._hidden, self._types)  # type: ignore[assignment]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "types": self._types, "hidden": self._hidden}
+
+
+def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
+    """PPO or SAC with the run's settings.
+
+    Args:
+        config: the settings.
+        env: what `training_environment` gives.
+        types: columns of the one-hot of agent types.
+        log: folder for TensorBoard, or None.
+    """
+    common: dict[str, Any] = {"seed": config.seed, "gamma": config.gamma, "tensorboard_log": log, "device": "cpu"}
+    net: dict[str, Any] = {"activation_fn": nn.ReLU}
+    if config.algorithm == "sac":
+        return SAC(
+            "MlpPolicy",
+            env,
+            learning_rate=config.learning_rate,
+            batch_size=config.batch_size,
+            buffer_size=400_000,
+            train_freq=1,
+            gradient_steps=4,
+            learning_starts=4 * env.num_envs,
+            policy_kwargs={**net, "net_arch": list(config.hidden)},
+            **common,
+        )
+    net["log_std_init"] = config.log_std
+    if config.per_type:
+        policy: Any = PerTypePolicy
+        net |= {"types": list(types), "hidden": list(config.hidden)}
+    else:
+        policy = "MlpPolicy"
+        net["net_arch"] = {"pi": list(config.hidden), "vf": list(config.hidden)}
+    rate = config.learning_rate
+    return PPO(
+        policy,
+        env,
+        learning_rate=LinearlyTo0(rate),
+        n_steps=config.n_steps,
+        batch_size=_divisor(config.n_steps * env.num_envs, config.batch_size),
+        n_epochs=config.n_epochs,
+        gae_lambda=config.gae_lambda,
+        clip_range=config.clip_range,
+        ent_coef=config.entropy,
+        policy_kwargs=net,
+        **common,
+    )
+
+
+def _divisor(samples: int, wanted: int) -> int:
+    """The batch size near the wanted one that divides an update's samples."""
+    count = max(1, round(samples / wanted))
+    while samples % count:
+        count += 1
+    return samples // count
+
+
+class LinearlyTo0:
+    """A learning rate that falls linearly to 0 with what remains of the training.
+
+    Args:
+        rate: at the beginning.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+
+    def __call__(self, remaining: float) -> float:
+        """The rate with a fraction `remaining` still to go."""
+        return self.rate * max(0.0, remaining)
+
+
+def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers]:
+    """The deterministic actor as arrays, by type of agent ("" for all).
+
+    Args:
+        model: PPO or SAC.
+        types: names of the agent types, in the order of the one-hot.
+    """
+    policy: Any = model.policy
+    if isinstance(model, SAC):
+        return {"": _layers([*policy.actor.latent_pi, policy.actor.mu])}
+    extractor, head = policy.mlp_extractor, policy.action_net
+    if not isinstance(extractor, PerTypeExtractor):
+        return {"": _layers([*extractor.policy_net, head])}
+    found = {}
+    weight, bias = (one.detach().numpy().copy() for one in (head.weight, head.bias))
+    width = weight.shape[1] // len(types)
+    for number, kind in enumerate(types):
+        block = weight[:, number * width : (number + 1) * width]
+        found[kind] = (*_layers(extractor.actors[number]), (block[:, :-1].copy(), bias + block[:, -1]))
+    return found
+
+
+def exported(
+    model: BaseAlgorithm,
+    config: TrainingConfig,
+    columns: Sequence[str],
+    types: Sequence[str],
+    scaler: ObservationScaler,
+    about: dict[str, Any],
+) -> LearnedPolicy:
+    """The model's actor as a policy that needs neither torch nor Stable-Baselines3.
+
+    Args:
+        model: PPO or SAC.
+        config: of the run.
+        columns: names of the observation's columns.
+        types: of agents.
+        scaler: of observations.
+        about: how it was trained.
+    """
+    shape = model.action_space.shape
+    assert shape is not None
+    squash, networks = config.algorithm == "sac", actor_layers(model, types)
+    return LearnedPolicy(config.environment, tuple(columns), int(shape[0]), squash, networks, scaler, about)
+
+
+def _mlp(features: int, hidden: Sequence[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for before, width in zip([features, *hidden[:-1]], hidden, strict=True):
+        layers += [nn.Linear(before, width), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def _layers(modules: Any) -> Layers:
+    return tuple(
+        (one.weight.detach().numpy().astype(np.float32), one.bias.detach().numpy().astype(np.float32))
+        for one in modules
+        if isinstance(one, nn.Linear)
+    )

@@ -1,0 +1,86 @@
+"""From an observation to what a network gets: fixed scales, and nothing where a slot is empty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.env import ObservationLayout
+from khop_env.env.layout import Float32Array
+
+METRE = 0.5  # a network's unit is 2 m, or 2 m/s
+RATE = 0.25  # and 4 m/s in how fast positions change
+MOST = 10.0  # larger scaled values are cut off: early policies run far away
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationScaler:
+    """Makes a network's features of uniform observations: scaled columns, and how fast positions change.
+
+    Each slot is multiplied by its validity. Scales are constants, not running statistics: early policies drift far away
+    and would spoil these. Changes are differences to the observation before, so that a policy knows how fast agents
+    move whose velocity isn't a state, as estimates of it allow.
+
+    Attributes:
+        scale: (D,) factor of each column.
+        valid: (D,) the column whose value says whether this one counts; D, for a constant 1, outside of slots.
+        moving: (R,) columns that are positions; empty for features of a single observation.
+        rate: factor of their changes, per m.
+    """
+
+    scale: Float32Array
+    valid: NDArray[np.int64]
+    moving: NDArray[np.int64]
+    rate: float
+
+    @classmethod
+    def of(cls, layouts: Sequence[ObservationLayout], control_period: float, rates: bool) -> ObservationScaler:
+        """Scales by unit.
+
+        Args:
+            layouts: of all agents, uniform.
+            control_period: in s.
+            rates: whether features hold changes.
+        """
+        units = zip(*([field.unit for field in layout.fields] for layout in layouts), strict=True)
+        scale = np.array([min(METRE if unit in ("m", "m/s") else 1.0 for unit in each) for each in units], np.float32)
+        layout = max(layouts, key=lambda layout: len(layout.slots))
+        names = layout.names
+        valid = np.full(len(names), len(names))
+        positions = list(layout.columns("slot0.position"))
+        moving = list(range(len(positions)))  # an observation begins with the own position
+        for column, name in enumerate(names):
+            slot, _, rest = name.partition(".")
+            if slot.startswith("slot") and rest != "valid":
+                valid[column] = names.index(f"{slot}.valid")
+            if slot.startswith("slot") and rest.startswith("position."):
+                moving.append(column)
+        return cls(scale, valid, np.array(moving if rates else [], np.int64), RATE / control_period)
+
+    @property
+    def size(self) -> int:
+        """Number of features."""
+        return len(self.scale) + len(self.moving)
+
+    def __call__(self, observations: Float32Array, before: Float32Array | None) -> Float32Array:
+        """Features (..., size).
+
+        Args:
+            observations: (..., D).
+            before: those one control period earlier; None at the beginning of an episode, whose changes are 0.
+        """
+        shape = observations.shape[:-1]
+        features = np.zeros((*shape, self.size), np.float32)
+        columns = len(self.scale)
+        np.multiply(observations, self.scale, out=features[..., :columns])
+        if before is not None and len(self.moving):
+            changes = observations[..., self.moving] - before[..., self.moving]
+            np.multiply(changes, np.float32(self.rate), out=features[..., columns:])
+        np.minimum(np.maximum(features, -MOST, out=features), MOST, out=features)
+        counts = np.concatenate([observations, np.ones((*shape, 1), np.float32)], axis=-1) > 0.5
+        features[..., :columns] *= counts[..., self.valid]
+        features[..., columns:] *= counts[..., self.valid[self.moving]]
+        return features

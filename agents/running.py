@@ -1,0 +1,83 @@
+"""A policy in its environment, stepped and recorded as a simulator is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from agents.learning.learned import PretrainedPolicy, pretrained_for
+from agents.policies import make_policy
+from agents.policy import Policy, describe
+from khop_env.env import EnvState, KHopEnv
+from khop_env.registry import environment_module
+from khop_env.scenarios import Scenario
+from khop_env.simulation import Extremes, Observe, Simulator
+
+
+class PolicyRun:
+    """What `results.record` takes: a simulator whose steps are control periods of an environment with a policy.
+
+    Args:
+        env: the environment; it is reset.
+        policy: who plays.
+        seed: of the episode.
+    """
+
+    def __init__(self, env: KHopEnv, policy: Policy, seed: int) -> None:
+        self.env, self.policy = env, policy
+        self.simulator: Simulator = env.batched.simulator
+        policy.reset(describe(env), [seed])
+        self._observations, _ = env.reset(seed=seed)
+        self._extremes = np.zeros((4, 1))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.simulator, name)
+
+    @property
+    def extremes(self) -> Extremes:
+        """The largest ratios since the reset, not only since the last action."""
+        return Extremes(*self._extremes.copy())
+
+    def step(self, dt: float) -> None:
+        """One control period, or, when `record` warms up, one short step of the simulator."""
+        if dt < 0.5 * self.env.batched.settings.control_period:
+            self.simulator.step(dt)
+            return
+        actions: Mapping[str, Any] = self.policy.act(self._observations)
+        self._observations, *_ = self.env.step(actions)
+        seen = self.simulator.extremes
+        values = seen.normalized, seen.relative, seen.input_normalized, seen.input_relative
+        self._extremes = np.maximum(self._extremes, values)
+
+    def save(self) -> EnvState:
+        """The environment's state."""
+        return self.env.get_state()
+
+    def restore(self, saved: EnvState) -> None:
+        """Back to it."""
+        self.env.set_state(saved)
+
+
+def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float, seed: int) -> PolicyRun:
+    """A learned policy in the environment that it was trained for.
+
+    Args:
+        spec: e.g. "ppo:runs/mine"; "ppo:pretrained" is the shipped one that there is for the scenario.
+        scenario: where it acts.
+        observe: observation mode.
+        duration: of the episode in s.
+        seed: of the episode.
+
+    Raises:
+        PolicyFileError: for a policy that doesn't fit.
+    """
+    policy = make_policy(spec)
+    about = pretrained_for(scenario.name) if isinstance(policy, PretrainedPolicy) else policy.about  # type: ignore[attr-defined]
+    make = environment_module(about["environment"]).parallel_env
+    env: KHopEnv = make(scenario, observe=observe, bounds=about["bounds"])
+    cycles = max(1, math.ceil(duration / env.batched.settings.control_period - 1e-9))
+    env = make(scenario, observe=observe, bounds=about["bounds"], max_cycles=cycles)
+    return PolicyRun(env, policy, seed)
