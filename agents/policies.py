@@ -8,11 +8,16 @@ from agents.laws import LAWS
 from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import Policy
-from agents.scripted import LawPolicy, RandomPolicy, ZeroPolicy
+from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
 from khop_env.physics import did_you_mean
 from khop_env.registry import parameters_from_text
 
-POLICIES = (*LAWS, "zero", "random")
+FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy]] = {
+    "zero": ZeroPolicy,
+    "random": RandomPolicy,
+    "bang_bang": BangBangPolicy,
+}
+POLICIES = (*LAWS, *FLOOR)
 """Names of the policies without a file of their own."""
 
 
@@ -40,4 +45,4 @@ def make_policy(spec: str) -> Policy:
         raise ValueError(f"no policy {name!r}; {did_you_mean(name, (*POLICIES, *ALGORITHMS))}")
     if given:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
-    return ZeroPolicy() if name == "zero" else RandomPolicy()
+    return FLOOR[name]()

@@ -49,6 +49,24 @@ class RandomPolicy:
         return dict(zip(observations, np.split(drawn, ends, axis=-1), strict=True))
 
 
+class BangBangPolicy(RandomPolicy):
+    """Full inputs of random sign, the same for all agents or not by turns of two seconds: an adversary of observers."""
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Seed the generators."""
+        super().reset(env, seeds)
+        self._cycle, self._turn = 0, max(1, round(2.0 / env.control_period))
+
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        """Signs."""
+        drawn = super().act(observations)
+        if self._cycle // self._turn % 2 == 0:
+            first = next(iter(drawn.values()))[..., :1]
+            drawn = {agent: np.broadcast_to(first, values.shape) for agent, values in drawn.items()}
+        self._cycle += 1
+        return {agent: np.where(values < 0.0, -1.0, 1.0).astype(np.float32) for agent, values in drawn.items()}
+
+
 class LawPolicy:
     """A feedback law that reads its quantities by name from observations, and acts once in a control period.
 

@@ -16,7 +16,7 @@ from agents.policy import EnvDescription, Observations
 from khop_env.env.layout import Float32Array
 
 FORMAT = 1
-_SCALER = ("scale", "valid", "moving", "rate")
+_SCALER = ("scale", "valid", "moving", "rate", "headed", "heading", "planar")
 PRETRAINED = Path(__file__).with_name("pretrained")
 
 Layers = tuple[tuple[Float32Array, Float32Array], ...]
@@ -145,7 +145,7 @@ class LearnedPolicy:
                     kind: tuple((stored[f"{kind}/{q}/weight"], stored[f"{kind}/{q}/bias"]) for q in range(count))
                     for kind, count in meta["layers"].items()
                 }
-                scaler = ObservationScaler(stored["scale"], stored["valid"], stored["moving"], float(stored["rate"]))
+                scaler = ObservationScaler(**{name: stored[name] for name in _SCALER})
         except PolicyFileError:
             raise
         except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:

@@ -20,7 +20,8 @@ MOST = 10.0  # larger scaled values are cut off: early policies run far away
 class ObservationScaler:
     """Makes a network's features of uniform observations: scaled columns, and how fast positions change.
 
-    Each slot is multiplied by its validity. Scales are constants, not running statistics: early policies drift far away
+    Each slot is multiplied by its validity, and agents with a heading get others' positions and displacements in their
+    own frame, in which their inputs act. Scales are constants, not running statistics: early policies drift far away
     and would spoil these. Changes are differences to the observation before, so that a policy knows how fast agents
     move whose velocity isn't a state, as estimates of it allow.
 
@@ -29,12 +30,18 @@ class ObservationScaler:
         valid: (D,) the column whose value says whether this one counts; D, for a constant 1, outside of slots.
         moving: (R,) columns that are positions; empty for features of a single observation.
         rate: factor of their changes, per m.
+        headed: (H,) columns that say that an agent's type has a heading; empty where none has.
+        heading: (2,) columns of its cosine and sine.
+        planar: (K, 2) features that are turned into the own frame, in pairs.
     """
 
     scale: Float32Array
     valid: NDArray[np.int64]
     moving: NDArray[np.int64]
     rate: float
+    headed: NDArray[np.int64]
+    heading: NDArray[np.int64]
+    planar: NDArray[np.int64]
 
     @classmethod
     def of(cls, layouts: Sequence[ObservationLayout], control_period: float, rates: bool) -> ObservationScaler:
@@ -58,7 +65,23 @@ class ObservationScaler:
                 valid[column] = names.index(f"{slot}.valid")
             if slot.startswith("slot") and rest.startswith("position."):
                 moving.append(column)
-        return cls(scale, valid, np.array(moving if rates else [], np.int64), RATE / control_period)
+        if not rates:
+            moving = []
+        headed, heading = _headings(layouts)
+        planar = []
+        if len(positions) == 2:
+            relative = [q for q, name in enumerate(names) if ".position." in name or ".displacement." in name]
+            relative += [len(names) + q for q, column in enumerate(moving) if column in relative]
+            planar = relative if len(headed) else []
+        return cls(
+            scale,
+            valid,
+            np.array(moving, np.int64),
+            RATE / control_period,
+            headed,
+            heading,
+            np.array(planar, np.int64).reshape(-1, 2),
+        )
 
     @property
     def size(self) -> int:
@@ -83,4 +106,23 @@ class ObservationScaler:
         counts = np.concatenate([observations, np.ones((*shape, 1), np.float32)], axis=-1) > 0.5
         features[..., :columns] *= counts[..., self.valid]
         features[..., columns:] *= counts[..., self.valid[self.moving]]
+        if len(self.planar):
+            turned = observations[..., self.headed].any(axis=-1, keepdims=True)
+            cos = np.where(turned, observations[..., [self.heading[0]]], np.float32(1.0))
+            sin = np.where(turned, observations[..., [self.heading[1]]], np.float32(0.0))
+            x, y = features[..., self.planar[:, 0]], features[..., self.planar[:, 1]]
+            features[..., self.planar[:, 0]] = cos * x + sin * y
+            features[..., self.planar[:, 1]] = cos * y - sin * x
         return features
+
+
+def _headings(layouts: Sequence[ObservationLayout]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns of the types that have a heading, and of its cosine and sine, if these are the same for all."""
+    headed, places = set(), set()
+    for layout in layouts:
+        if "own.heading.cos" in layout.names:
+            headed.add(layout.index(f"own.type.{layout.agent.rpartition('_')[0]}"))
+            places.add((layout.index("own.heading.cos"), layout.index("own.heading.sin")))
+    if len(places) != 1:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    return np.array(sorted(headed)), np.array(places.pop())

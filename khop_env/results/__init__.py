@@ -1,7 +1,7 @@
 """THE RECORD: trajectories as tidy tables, metrics, figures and design reports."""
 
 from khop_env.results.assumptions import Assumption, assumptions
-from khop_env.results.curves import error_over_time, set_iss_figure
+from khop_env.results.curves import error_over_time, learning_curves, set_iss_figure
 from khop_env.results.figures import paper_figure
 from khop_env.results.metrics import consensus_error, summarize
 from khop_env.results.recording import ObserverRecord, Recording, record
@@ -19,6 +19,7 @@ __all__ = [
     "design_report",
     "error_over_time",
     "estimates_table",
+    "learning_curves",
     "paper_figure",
     "record",
     "set_iss_figure",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -118,4 +119,37 @@ def set_iss_figure(
             axes.legend(loc="upper left", fontsize=8.5)
         figure.suptitle(title, fontsize=10.5, color="#333333")
         figure.savefig(path, dpi=150)
+    return Path(path)
+
+
+def learning_curves(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], path: str | Path) -> Path:
+    """Learning curves, a panel per task: the median over training seeds, and the band between the extremes.
+
+    Args:
+        curves: by title, the agent-steps (T,) and by name the mean returns (seeds, T).
+        path: of the image file.
+
+    Returns:
+        The path.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 3.1 * math.ceil(len(curves) / 2)), layout="constrained")
+        panels = figure.subplots(math.ceil(len(curves) / 2), 2, squeeze=False).ravel()
+        for axes, (title, (steps, named)) in zip(panels, curves.items(), strict=False):
+            for color, dashes, (name, returns) in zip(COLORS, (*_DASHES, "-."), named.items(), strict=False):
+                axes.plot(steps / 1e6, -np.median(returns, axis=0), color=color, linestyle=dashes, label=name)
+                axes.fill_between(
+                    steps / 1e6, -returns.max(axis=0), -returns.min(axis=0), color=color, alpha=0.12, linewidth=0.0
+                )
+            axes.set_yscale("log")
+            axes.set_title(title, loc="left")
+            axes.set_xlabel("million agent-steps")
+            axes.set_ylabel("cost (minus the return)")
+        for axes in panels[len(curves) :]:
+            axes.set_axis_off()
+        panels[0].legend(fontsize=8.5, title="trained on")
+        figure.savefig(path, dpi=130)
     return Path(path)

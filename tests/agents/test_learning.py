@@ -142,6 +142,24 @@ def test_the_last_observation_is_scaled_like_the_others():
     assert infos[row]["terminal_observation"].shape == (scaler.size,)
 
 
+def test_agents_with_a_heading_see_others_in_their_own_frame():
+    """Turned by their heading; integrators and carts as they stand."""
+    env = batched("formation_v0", "mixed_fleet", num_envs=3)
+    observations, _ = env.reset(0)
+    features = ObservationScaler.of(env.layouts, 0.05, rates=True)(observations, observations)
+    for number, layout in enumerate(env.layouts):
+        seen, found = observations[:, number], features[:, number]
+        cos, sin = 1.0, 0.0
+        if "own.heading.cos" in layout.names:
+            cos, sin = seen[:, layout.index("own.heading.cos")], seen[:, layout.index("own.heading.sin")]
+        for what in ("position", "displacement"):
+            columns = layout.columns(f"slot0.{what}")
+            x, y = 0.5 * seen[:, columns].T
+            np.testing.assert_allclose(found[:, columns[0]], cos * x + sin * y, atol=1e-6)
+            np.testing.assert_allclose(found[:, columns[1]], cos * y - sin * x, atol=1e-6)
+        np.testing.assert_allclose(found[:, :2], 0.5 * seen[:, :2], atol=1e-6)
+
+
 def test_huber_bounds_the_slope_of_the_reward():
     """Far away the training reward is linear in the error, near the goal it is the environment's."""
     config = dataclasses.replace(SMALL, environment="consensus_v0", scenario="paper", huber=1.0)

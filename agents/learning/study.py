@@ -1,0 +1,282 @@
+"""The published table: policies trained on estimates, the truth, and neighbours only, beside tuned scripts.
+
+Every run is kept in a folder of its own, and one that has finished isn't trained again, so that a study that was
+interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import multiprocessing
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.comparison import Comparison, Row, compare, interval95
+from agents.learning.config import TrainingConfig
+from khop_env.observers import FloatArray
+from khop_env.simulation import OBSERVE, Observe
+
+SCRIPTS = ("tanh", "linear", "formation", "leader_following")
+SEEDS = range(5)
+EPISODES = range(100)
+DONE = "finished"
+
+
+@dataclass(frozen=True)
+class StudyTask:
+    """One block of the table.
+
+    Attributes:
+        environment: its name.
+        scenario: its name.
+        timesteps: agent-steps of each training.
+    """
+
+    environment: str
+    scenario: str
+    timesteps: int
+
+    @property
+    def label(self) -> str:
+        """For files and titles."""
+        return f"{self.environment} on {self.scenario}"
+
+
+TASKS = (
+    StudyTask("consensus_v0", "paper", 1_000_000),
+    StudyTask("leader_following_v0", "convoy", 1_500_000),
+    StudyTask("leader_following_v0", "mixed_fleet", 1_500_000),
+    StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000),
+)
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "estimate": {"observe": "estimate"},
+    "oracle": {"observe": "oracle"},
+    "local": {"observe": "local"},
+    "estimate + bounds": {"observe": "estimate", "bounds": True},
+}
+"""What is trained on."""
+
+
+@dataclass(frozen=True)
+class Learned:
+    """One variant's policies, played on one kind of observation.
+
+    Attributes:
+        variant: what they were trained on.
+        observe: what they are played on.
+        returns: (seeds, episodes).
+        rows: one per training seed.
+    """
+
+    variant: str
+    observe: Observe
+    returns: FloatArray
+    rows: list[Row]
+
+    @property
+    def label(self) -> str:
+        """E.g. "PPO trained on oracle, played on estimate"."""
+        if self.variant in (self.observe, f"{self.observe} + bounds"):
+            return f"PPO on {self.variant}"
+        return f"PPO trained on {self.variant}, on {self.observe}"
+
+
+@dataclass(frozen=True)
+class Block:
+    """Everything measured of one task.
+
+    Attributes:
+        task: which.
+        scripts: rows of the scripted policies under all observation modes, and of bang-bang adversaries.
+        learned: those of the learned ones.
+        curves: {variant: (seeds, evaluations)} learning curves, mean returns.
+        timesteps: (evaluations,) of the curves.
+        seconds: of training, all runs added up.
+    """
+
+    task: StudyTask
+    scripts: Comparison
+    learned: list[Learned]
+    curves: dict[str, FloatArray]
+    timesteps: FloatArray
+    seconds: float
+
+
+def folder_of(root: Path, task: StudyTask, variant: str, seed: int) -> Path:
+    """Where a run is kept."""
+    scenario = task.scenario.replace(":", "-").replace("=", "")
+    return root / f"{task.environment}-{scenario}" / f"{variant.replace(' + ', '-')}-{seed}"
+
+
+def train_all(
+    root: Path,
+    tasks: Sequence[StudyTask] = TASKS,
+    seeds: Sequence[int] = SEEDS,
+    *,
+    workers: int = 2,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Train what hasn't been trained yet, in several processes.
+
+    Args:
+        root: folder of the study.
+        tasks: blocks of the table.
+        seeds: training seeds.
+        workers: processes.
+        say: told of every run that ends.
+    """
+    jobs = [
+        (root, task, variant, seed)
+        for seed in seeds
+        for task in tasks
+        for variant in VARIANTS
+        if not (folder_of(root, task, variant, seed) / DONE).exists()
+    ]
+    start = time.perf_counter()
+    spawned = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawned) as pool:
+        for done, text in enumerate(pool.map(_train, jobs), 1):
+            left = (time.perf_counter() - start) / done * (len(jobs) - done)
+            say(f"{done} of {len(jobs)}: {text}; about {left / 60:.0f} min left")
+
+
+def measure(
+    root: Path, task: StudyTask, seeds: Sequence[int] = SEEDS, episodes: Sequence[int] = EPISODES, *, workers: int = 2
+) -> Block:
+    """Play everything of one task over the same episodes.
+
+    Args:
+        root: folder of the study.
+        task: which block.
+        seeds: training seeds.
+        episodes: seeds of the episodes.
+        workers: processes.
+    """
+
+    def played(policies: Sequence[str], observe: Sequence[Observe], bounds: bool = False) -> Comparison:
+        return compare(
+            task.environment,
+            policies,
+            observe,
+            scenario=task.scenario,
+            seeds=episodes,
+            workers=workers,
+            arguments={"bounds": True} if bounds else {},
+        )
+
+    scripts = played([*SCRIPTS, "bang_bang", "zero", "random"], OBSERVE)
+    learned = []
+    plays: list[tuple[str, Observe]] = [(name, chosen["observe"]) for name, chosen in VARIANTS.items()]
+    for variant, observe in [*plays, ("oracle", "estimate")]:
+        specs = [f"ppo:{folder_of(root, task, variant, seed)}" for seed in seeds]
+        rows = played(specs, (observe,), bool(VARIANTS[variant].get("bounds"))).rows
+        learned.append(Learned(variant, observe, np.array([row.episodes.returns for row in rows]), rows))
+    curves, seconds = {}, 0.0
+    for variant in VARIANTS:
+        found = []
+        for seed in seeds:
+            folder = folder_of(root, task, variant, seed)
+            found.append(np.loadtxt(folder / "curve.csv", delimiter=",", skiprows=1))
+            seconds += float((folder / DONE).read_text())
+        shortest = min(map(len, found))
+        curves[variant] = np.array([one[:shortest, 1] for one in found])
+        steps = found[0][:shortest, 0]
+    return Block(task, scripts, learned, curves, steps, seconds)
+
+
+def table(block: Block) -> Iterator[str]:
+    """The block in Markdown: means, intervals over episodes, spread over seeds, and the guarantee."""
+    yield f"### {block.task.label}\n"
+    yield "| policy | return | spread over seeds | error at the end (m) | largest \\|e\\| | after the transient |"
+    yield "|---|---|---|---|---|---|"
+    best = {
+        mode: max(
+            (row for row in block.scripts.rows if row.observe == mode and row.policy in SCRIPTS),
+            key=lambda row: float(row.episodes.returns.mean()),
+        )
+        for mode in OBSERVE
+    }
+    for row in block.scripts.rows:
+        is_best, floor = row is best[row.observe], row.policy not in SCRIPTS and row.observe == "estimate"
+        if is_best or floor or row.policy == "tanh":
+            name = row.policy if floor else f"{row.policy}, tuned, on {row.observe}"
+            yield _line(name + " (best script)" * is_best, row.episodes.returns[None], [row])
+    for learned in block.learned:
+        yield _line(learned.label, learned.returns, learned.rows)
+    yield ""
+    for text in comparisons(block, best["estimate"], best["local"]):
+        yield f"- {text}"
+    yield ""
+
+
+def comparisons(block: Block, script: Row, local_script: Row) -> Iterator[str]:
+    """What the table says about the questions it was made for; differences are paired by episode and training seed."""
+    by = {(one.variant, one.observe): one for one in block.learned}
+    estimate, transferred = by["estimate", "estimate"], by["oracle", "estimate"]
+    yield _paired("learned on estimates, against learned on the truth", estimate, by["oracle", "oracle"])
+    yield _paired("trained on the truth but played on estimates, against trained on estimates", transferred, estimate)
+    yield _paired("with the guaranteed bounds, against without", by["estimate + bounds", "estimate"], estimate)
+    paper = next(row for row in block.scripts.rows if (row.policy, row.observe) == ("tanh", "estimate"))
+    learned = estimate.returns.mean(axis=0)
+    for what, returns in (
+        (f"the best tuned script on estimates ({script.policy})", script.episodes.returns),
+        ("the paper's law on estimates, tuned (tanh)", paper.episodes.returns),
+        (f"the best tuned script on neighbours only ({local_script.policy})", local_script.episodes.returns),
+        ("learned on neighbours only", by["local", "local"].returns.mean(axis=0)),
+    ):
+        more, interval = learned - returns, float(interval95(learned - returns) or 0.0)
+        verdict = "better" if more.mean() > interval else "worse" if more.mean() < -interval else "no difference seen"
+        relative = 100.0 * more.mean() / abs(returns.mean())
+        yield f"learned on estimates, against {what}: {more.mean():+.3g} ± {interval:.2g} ({relative:+.2g} %): {verdict}"
+
+
+def largest_ratio(block: Block) -> tuple[float, float, float]:
+    """Largest |e| over all rows and episodes, after the transient, and largest error over its bound."""
+    rows = [*block.scripts.rows, *(row for one in block.learned for row in one.rows)]
+    seen = [row.episodes for row in rows]
+    return (
+        max(float(one.max_normalized_disagreement.max()) for one in seen),
+        max(float(one.late_normalized_disagreement.max()) for one in seen),
+        max(float(one.max_error_to_bound.max()) for one in seen),
+    )
+
+
+def _line(name: str, returns: FloatArray, rows: Sequence[Row]) -> str:
+    mean, interval = returns.mean(), interval95(returns.mean(axis=0))
+    spread = f"{returns.mean(axis=1).std(ddof=1):.3g}" if len(returns) > 1 else ""
+    seen = [row.episodes for row in rows]
+    error = np.mean([one.final_task_error.mean() for one in seen])
+    worst = max(float(one.max_normalized_disagreement.max()) for one in seen)
+    late = max(float(one.late_normalized_disagreement.max()) for one in seen)
+    return f"| {name} | {mean:.4g} ± {interval:.2g} | {spread} | {error:.3g} | {worst:.3f} | {late:.3f} |"
+
+
+def _paired(what: str, one: Learned, other: Learned) -> str:
+    """Relative to the other, by training seed."""
+    percent = 100.0 * (one.returns - other.returns).mean(axis=1) / np.abs(other.returns.mean(axis=1))
+    more = (one.returns - other.returns).mean(axis=0)
+    interval = interval95(percent) if len(percent) > 1 else None
+    over_seeds = "" if interval is None else f" ± {interval:.2g} % over training seeds"
+    return f"{what}: {percent.mean():+.2g} %{over_seeds}; paired by episode {more.mean():+.3g} ± {interval95(more):.2g}"
+
+
+def _train(job: tuple[Path, StudyTask, str, int]) -> str:
+    from agents.learning.training import CHECKPOINT, train
+
+    root, task, variant, seed = job
+    folder = folder_of(root, task, variant, seed)
+    config = TrainingConfig(task.environment, task.scenario, timesteps=task.timesteps, seed=seed, **VARIANTS[variant])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        training = train(config, folder, resume=(folder / CHECKPOINT).exists())
+    if training.finished:
+        (folder / DONE).write_text(f"{training.seconds:.1f}")
+    best = max(one.mean_return for one in training.curve)
+    return f"{task.label}, {variant}, seed {seed}: {best:.3f} in {training.seconds:.0f} s"
