@@ -46,6 +46,13 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._task, completed=fraction)
 
+    def say(self, text: str) -> None:
+        """A message on stderr, above the bar where there is one."""
+        if self._bar is not None:
+            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            say(text)
+
 
 def _bar(label: str) -> tuple[Any, Any]:
     from rich import progress

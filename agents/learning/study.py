@@ -233,8 +233,8 @@ def comparisons(block: Block, script: Row, local_script: Row) -> Iterator[str]:
     ):
         more, interval = learned - returns, float(interval95(learned - returns) or 0.0)
         verdict = "better" if more.mean() > interval else "worse" if more.mean() < -interval else "no difference seen"
-        relative = 100.0 * more.mean() / abs(returns.mean())
-        yield f"learned on estimates, against {what}: {more.mean():+.3g} ± {interval:.2g} ({relative:+.2g} %): {verdict}"
+        relative = f"{100.0 * more.mean() / abs(returns.mean()):+.2g} %"
+        yield f"learned on estimates, against {what}: {more.mean():+.3g} ± {interval:.2g} ({relative}): {verdict}"
 
 
 def largest_ratio(block: Block) -> tuple[float, float, float]:

@@ -26,6 +26,9 @@ def evaluate(
         str, typer.Option(help="Names, with parameters after a colon: tanh,linear:gain=2,cancel_drift=true,zero.")
     ] = "tanh,linear,zero,random",
     observe: Annotated[str, typer.Option(help="Observation modes.")] = "estimate,oracle,local",
+    bounds: Annotated[
+        bool, typer.Option("--bounds", help="Observations hold the guaranteed bounds; for policies trained with them.")
+    ] = False,
     episodes: Annotated[int, typer.Option(min=1, help="Of each row, the same for all.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Of the first episode.")] = 0,
     workers: Annotated[int, typer.Option(min=1, help="Processes; the numbers don't depend on how many.")] = 1,
@@ -51,6 +54,7 @@ def evaluate(
                 seeds=range(seed, seed + episodes),
                 workers=workers,
                 ray=ray,
+                arguments={"bounds": True} if bounds else None,
                 progress=progress,
             )
     if as_json:

@@ -60,7 +60,7 @@ def train(
         def told(fraction: float, evaluation: Evaluation | None) -> None:
             progress(fraction)
             if evaluation is not None:
-                say(
+                progress.say(
                     f"{evaluation.timesteps:>10,} agent-steps: return {evaluation.mean_return:8.3f}, task error at the "
                     f"end {evaluation.final_task_error:.3f} m, largest |e| {evaluation.max_normalized_disagreement:.3f}"
                 )

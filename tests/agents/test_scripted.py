@@ -69,7 +69,7 @@ def test_a_policy_does_what_its_law_does(environment, scenario, observe, uniform
         assert not actions[agent][:, mine.shape[1] :].any()
 
 
-@pytest.mark.parametrize("name", [*LAWS, "zero", "random"])
+@pytest.mark.parametrize("name", [*LAWS, "zero", "random", "bang_bang"])
 def test_one_observation_or_a_batch(name):
     """A policy plays a ParallelEnv as it plays a batch: the same bits for the same seed."""
     single, several = (
@@ -90,11 +90,11 @@ def test_one_observation_or_a_batch(name):
         rows, *_ = several.step(np.stack([theirs[agent] for agent in several.agents], axis=1))
 
 
-@pytest.mark.parametrize("name", [*LAWS, "zero", "random"])
+@pytest.mark.parametrize("name", [*LAWS, "zero", "random", "bang_bang"])
 @pytest.mark.parametrize("observe", ["estimate", "local"])
 def test_a_policy_sees_nothing_beyond_its_observation(name, observe):
     """What i can't know is changed: i acts as before. (On the truth it doesn't: so the test can fail.)"""
-    for mode, alike in ((observe, True), ("oracle", name in ("zero", "random"))):
+    for mode, alike in ((observe, True), ("oracle", name in ("zero", "random", "bang_bang"))):
         env = parallel("consensus_v0", "paper", observe=mode)
         policy = make_policy(name)
         policy.reset(describe(env), seeds=[0])
