@@ -19,13 +19,15 @@ lint: .venv/dev
 bench: .venv/bench $(if $(PEERS),.peers/mpe2/done .peers/vmas/done .peers/jaxmarl/done)
 	$(BIN)/khop bench $(if $(PEERS),--peers .peers)
 
-# RLlib, TorchRL and Tianshou with the environments, and evaluation on Ray, each library in an environment of its own (minutes)
+# RLlib, TorchRL and Tianshou with the environments, evaluation on Ray, and short trainings, each library in an environment of its own (minutes)
 integrations: .peers/rllib/done .peers/torchrl/done .peers/tianshou/done
 	for name in rllib torchrl tianshou; do .peers/$$name/bin/python examples/integrations/run_$$name.py || exit 1; done
 	.peers/rllib/bin/python examples/integrations/run_evaluation_on_ray.py
+	for how in '' --per-type; do .peers/rllib/bin/python examples/learning/train_rllib.py --iterations 2 $$how || exit 1; done
+	for how in '' --ippo; do .peers/torchrl/bin/python examples/learning/train_torchrl.py --iterations 3 $$how || exit 1; done
 
 .peers/rllib/done: PACKAGES = -e '.[ray]' torch
-.peers/torchrl/done: PACKAGES = -e . 'torchrl>=0.7'
+.peers/torchrl/done: PACKAGES = -e . 'torchrl>=0.14'
 .peers/tianshou/done: PACKAGES = -e . 'tianshou>=2.0'
 .peers/mpe2/done: PACKAGES = mpe2 pygame-ce
 .peers/vmas/done: PACKAGES = vmas torch
