@@ -29,7 +29,7 @@ integrations: .peers/rllib/done .peers/torchrl/done .peers/tianshou/done
 .peers/rllib/done: PACKAGES = -e '.[ray]' torch
 .peers/torchrl/done: PACKAGES = -e . 'torchrl>=0.14'
 .peers/tianshou/done: PACKAGES = -e . 'tianshou>=2.0'
-.peers/mpe2/done: PACKAGES = mpe2 pygame-ce
+.peers/mpe2/done: PACKAGES = mpe2 pygame-ce supersuit stable-baselines3 torch
 .peers/vmas/done: PACKAGES = vmas torch
 .peers/jaxmarl/done: PACKAGES = jaxmarl jax
 .peers/%/done: constraints.txt
