@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.evaluation import Episodes, Progress, play
+from agents.learning.learned import LearnedPolicy
 from agents.policies import make_policy
+from agents.policy import describe
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 from khop_env.registry import environment_module
@@ -26,7 +28,8 @@ if TYPE_CHECKING:
 
 CHUNK = 25  # episodes played at once; fixed, so that no number depends on who plays how many
 
-_Task = tuple[str, str, Observe, tuple[int, ...], tuple[tuple[str, Any], ...], str]
+_Arguments = tuple[tuple[str, Any], ...]
+_Task = tuple[str, str, Observe, tuple[int, ...], _Arguments, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +52,7 @@ class Row:
         return f"{self.policy} on {self.observe}"
 
     def summary(self) -> dict[str, Any]:
-        """The row in a few numbers; what isn't finite is None."""
+        """The row in a few numbers; a settling time that isn't finite is None."""
         seen = self.episodes
         return {
             "policy": self.policy,
@@ -122,7 +125,8 @@ def compare(
         seeds: one per episode.
         workers: processes; the numbers don't depend on how many.
         ray: play on a Ray cluster instead (the one that is running, or a local one).
-        arguments: others of the environment's, e.g. {"max_cycles": 100}.
+        arguments: others of the environment's, e.g. {"max_cycles": 100}. A learned policy that was trained with bounds
+            in its observations gets them anyhow.
         progress: told how far it is.
 
     Raises:
@@ -133,14 +137,22 @@ def compare(
         raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
     module = environment_module(environment)
     name = inspect.signature(module.batched_env).parameters["scenario"].default if scenario is None else scenario
-    for spec in policies:
-        make_policy(spec)
-    known = tuple(sorted((arguments or {}).items()))
-    for mode in observe:  # refuses what there isn't, before anything is played
-        full_name = _environment(environment, name, mode, known, 1).scenario
+    if not policies or not observe or len(set(observe)) < len(observe):
+        raise ValueError(f"name at least one policy and one observation mode, each once; got {list(observe)}")
+    asked: dict[str, _Arguments] = {}
+    for spec in policies:  # refuses what there isn't, or doesn't fit, before anything is played
+        policy = make_policy(spec)
+        with_bounds = {"bounds": True} if isinstance(policy, LearnedPolicy) and policy.about.get("bounds") else {}
+        asked[spec] = tuple(sorted({**with_bounds, **(arguments or {})}.items()))
+        for mode in observe:
+            env = _environment(environment, name, mode, asked[spec], 1)
+            try:
+                policy.reset(describe(env), [0])
+            except ValueError as error:
+                raise ValueError(f"policy {spec!r}: {error}") from error
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
     tasks: list[_Task] = [
-        (environment, name, mode, chunk, known, spec) for spec in policies for mode in observe for chunk in chunks
+        (environment, name, mode, chunk, asked[spec], spec) for spec in policies for mode in observe for chunk in chunks
     ]
     results: list[Any] = [None] * len(tasks)
     for done, (number, result) in enumerate(_run(tasks, workers, ray), 1):
@@ -150,16 +162,20 @@ def compare(
     pairs = [(spec, mode) for spec in policies for mode in observe]
     parts = [results[first : first + len(chunks)] for first in range(0, len(tasks), len(chunks))]
     rows = [Row(spec, mode, Episodes.joined(mine)) for (spec, mode), mine in zip(pairs, parts, strict=True)]
-    return Comparison(environment, full_name, rows)
+    return Comparison(environment, env.scenario, rows)
 
 
 def interval95(values: FloatArray) -> float | None:
     """Half width of the 95 % confidence interval of the mean (Student's t); None for a single value.
 
-    The quantile is Cornish and Fisher's expansion (Abramowitz and Stegun, 26.7.5), within 1 % from 4 values on.
+    The quantile is Cornish and Fisher's expansion (Abramowitz and Stegun, 26.7.5), within 1 % from 4 values on; exact
+    for 2 and 3.
     """
     if len(values) < 2:
         return None
+    if len(values) < 4:
+        t = (12.7062, 4.3027)[len(values) - 2]
+        return t * float(np.std(values, ddof=1)) / math.sqrt(len(values))
     z, n = statistics.NormalDist().inv_cdf(0.975), len(values) - 1
     t = z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
     t += (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
@@ -193,9 +209,7 @@ def _play_task(task: _Task) -> Episodes:
 
 
 @lru_cache(maxsize=4)
-def _environment(
-    environment: str, scenario: str, observe: Observe, arguments: tuple[tuple[str, Any], ...], batch: int
-) -> BatchedEnv:
+def _environment(environment: str, scenario: str, observe: Observe, arguments: _Arguments, batch: int) -> BatchedEnv:
     make: Callable[..., BatchedEnv] = environment_module(environment).batched_env
     return make(scenario, num_envs=batch, observe=observe, **dict(arguments))
 

@@ -16,10 +16,11 @@ class TanhConsensus(VelocityLaw):
     """v_i = k_c sum over task edges of tanh(p_j - p_i - d_ij), component by component, p_j as heard or estimated.
 
     The paper's u_i, with the task's displacements d_ij (zero in consensus). Goal set A: p_j - p_i = d_ij on all task
-    edges. Set-ISS with respect to A, for a common Lipschitz drift, a connected task graph and commands below the input
-    limits, in the region of `ComparisonGain`, which derives the gain gamma; without drift in the whole space for small
-    errors. Other models (carts, unicycles, vessels) follow the commanded velocity with their own controllers: for them
-    it is measured only.
+    edges. In consensus set-ISS with respect to A, for a common Lipschitz drift, a connected task graph and commands
+    below the input limits, in the region of `ComparisonGain`, which derives the gain gamma; without drift in the whole
+    space for small errors, and then with displacements, too. With displacements and a drift A isn't invariant, since
+    agents that stand apart drift differently: measured only. Other models (carts, unicycles, vessels) follow the
+    commanded velocity with their own controllers: measured only.
 
     Attributes:
         gain: k_c in 1/s, positive and finite.
@@ -48,9 +49,10 @@ class LinearConsensus(VelocityLaw):
     """v_i = k sum over task edges of (p_j - p_i - d_ij), cut off at the input limits.
 
     The standard protocol (R. Olfati-Saber and R. M. Murray, IEEE Trans. Automatic Control 49(9), 2004) with saturation.
-    Goal set A as for `TanhConsensus`. Set-ISS with respect to A, for agents with a common Lipschitz drift and a
-    connected task graph, while no input saturates: `ComparisonGain` derives the linear gain and its region. Beyond it,
-    with the drift cancelled, and for models with other inputs: measured only.
+    Goal set A as for `TanhConsensus`. In consensus set-ISS with respect to A, for agents with a common Lipschitz drift
+    and a connected task graph, while no input saturates: `ComparisonGain` derives the linear gain and its region;
+    without drift with displacements, too. Beyond it, with displacements under a drift, with the drift cancelled, and
+    for models with other inputs: measured only.
 
     Attributes:
         gain: k in 1/s, positive and finite.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.policies import make_policy
-from agents.policy import Policy, batched_of, by_agent, describe
+from agents.policy import Policy, batched_of, by_agent, describe, policy_seeds
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 
@@ -31,7 +31,7 @@ class Episodes:
         final_task_error: (E,) mean over the agents of their task error at the end, in m.
         settling_time: (E,) time from which the team's mean task error stays at or below a tenth of the initial one, in
             s; infinite if it doesn't.
-        effort: (E,) mean over agents and time of the squared actions (fractions of the input limits).
+        effort: (E,) mean over agents and time of |u|^2, u in fractions of the input limits.
         max_normalized_disagreement: (E,) largest |xi| / rho of all observers.
         late_normalized_disagreement: (E,) the same after the first quarter of the episode: without the transient.
         max_error_to_bound: (E,) largest |error| / bound.
@@ -149,7 +149,7 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
     error, returns, effort = np.zeros((horizon + 1, env.batch)), np.zeros(env.batch), np.zeros(env.batch)
     worst, late, bound = (np.zeros(env.batch) for _ in range(3))
     inputs = np.array([env.fleet.models[env.fleet.agent(agent)].m for agent in env.agents])
-    policy.reset(describe(env), seeds)
+    policy.reset(describe(env), policy_seeds(seeds))
     observations, infos = env.reset(seeds)
     error[0] = infos["task_error"].mean(axis=1)
     running, length = np.ones(env.batch, bool), np.full(env.batch, horizon)

@@ -22,7 +22,8 @@ class LeaderFollowingLaw(VelocityLaw):
     gamma(s) = s for estimation errors d, and with the leader's speed |q'| as one more input that keeps it away from A.
     With s < 1, saturation, or other models: measured only.
 
-    An agent that knows nothing of its leader keeps near the origin, where initial sets are centred.
+    An agent that knows nothing of its leader keeps near the origin, where the library's initial sets are centred: prior
+    knowledge, which in consensus is enough to meet without hearing anybody.
 
     Attributes:
         gain: k in 1/s, positive and finite.

@@ -9,8 +9,8 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from agents.velocity_law import VELOCITY_INPUTS
 from khop_env.observers import FloatArray
+from khop_env.physics import DriftingIntegrator, SingleIntegrator
 from khop_env.scenarios import Scenario
 
 
@@ -65,22 +65,29 @@ class ComparisonGain:
         pull = np.tanh(math.sqrt(2.0) * b) / math.sqrt(2.0) if self.bounded else b
         return np.asarray(self.coupling * pull - self.lipschitz * b)
 
-    def step(self, distance: FloatArray, error: FloatArray, dt: float) -> FloatArray:
-        """Where the comparison equation b' = -h(b) + k sqrt(D) |d| goes in `dt` seconds; inf once it leaves the region.
+    def step(
+        self, distance: FloatArray, error: FloatArray, dt: float, disturbance: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Where the comparison equation b' = -h(b) + k sqrt(D) |d| + |Pi w| goes in `dt` seconds.
 
         Args:
             distance: bounds on |e| now, in m.
             error: |d| during the step, in m.
             dt: in s.
+            disturbance: |Pi w| during the step, in m/s.
+
+        Returns:
+            In m; inf once it has left the region.
         """
-        pushed = self.error_weight * error
+        gone, distance = np.isinf(distance), np.where(np.isinf(distance), 0.0, distance)
+        pushed = self.error_weight * error + disturbance
         one = pushed - self.decrease(distance)  # the classical Runge-Kutta step
         two = pushed - self.decrease(distance + 0.5 * dt * one)
         three = pushed - self.decrease(distance + 0.5 * dt * two)
         four = pushed - self.decrease(distance + dt * three)
         after = distance + dt / 6.0 * (one + 2.0 * two + 2.0 * three + four)
         largest = np.array([self.region(float(one)) for one in error.flat]).reshape(error.shape)
-        return np.where(np.maximum(distance, after) <= largest, after, math.inf)
+        return np.where(~gone & (np.maximum(distance, after) <= largest), after, math.inf)
 
     def ultimate(self, error: float, disturbance: float = 0.0) -> float:
         """h^-1(k sqrt(D) |d| + |Pi w|): the distance below which |e| ends, in m.
@@ -90,9 +97,11 @@ class ComparisonGain:
             disturbance: bound on |Pi w| in m/s.
 
         Returns:
-            inf where they are too large for the argument.
+            inf where they are too large for the argument, or the drift too strong.
         """
         pushed, low, high = self.error_weight * error + disturbance, 0.0, self.region(error)
+        if high <= 0.0:
+            return math.inf
         if pushed == 0.0:
             return 0.0
         if math.isinf(high):
@@ -109,6 +118,9 @@ class ComparisonGain:
         return high
 
 
+_COMMON_DRIFT = (SingleIntegrator, DriftingIntegrator)  # none of their parameters changes the drift
+
+
 def consensus_gain(scenario: Scenario, gain: float, *, bounded: bool) -> ComparisonGain | None:
     """The comparison of a consensus law on a scenario, where one can be derived.
 
@@ -118,11 +130,11 @@ def consensus_gain(scenario: Scenario, gain: float, *, bounded: bool) -> Compari
         bounded: whether it acts on the tanh of displacements.
 
     Returns:
-        None if agents differ in their drift, aren't moved by x' = f(x) + u, or aren't connected by the task graph; or
-        if tanh commands could exceed an input limit.
+        None unless all agents are single or all drifting integrators, which have one f and move by x' = f(x) + u, and
+        the task graph connects them; or if tanh commands could exceed an input limit.
     """
     fleet, task, models = scenario.fleet, scenario.task, scenario.fleet.models
-    if any(model.type not in VELOCITY_INPUTS or type(model) is not type(models[0]) for model in models):
+    if type(models[0]) not in _COMMON_DRIFT or any(type(model) is not type(models[0]) for model in models):
         return None
     if len(models) < 2 or not nx.is_connected(task):
         return None

@@ -37,7 +37,14 @@ def make_policy(spec: str) -> Policy:
     if name in ALGORITHMS:
         if not given:
             raise ValueError(f"policy {spec!r}: say which, {name}:FOLDER or {name}:pretrained")
-        return PretrainedPolicy() if given == "pretrained" else LearnedPolicy.load(given)
+        if given == "pretrained":
+            if name != "ppo":
+                raise ValueError(f"policy {spec!r}: the shipped policies are ppo:pretrained")
+            return PretrainedPolicy()
+        policy = LearnedPolicy.load(given)
+        if policy.about["algorithm"] != name:
+            raise ValueError(f"policy {spec!r}: {given} was trained by {policy.about['algorithm']}")
+        return policy
     if name in LAWS:
         parameters = parameters_from_text(given, get_type_hints(LAWS[name]), f"policy {spec!r}")
         return LawPolicy(name, parameters)

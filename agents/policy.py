@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
 from khop_env.physics import AgentModel
@@ -17,7 +19,7 @@ Observations = Mapping[str, Float32Array]
 
 @dataclass(frozen=True, eq=False)
 class EnvDescription:
-    """The environment as its designer knows it beforehand; no state, and no way to one.
+    """The environment as its designer knows it beforehand: names, models, layouts, and no state.
 
     Attributes:
         environment: e.g. "consensus_v0".
@@ -51,7 +53,8 @@ class Policy(Protocol):
 
         Args:
             env: what is known beforehand.
-            seeds: one per environment of the batch, for policies that draw random numbers.
+            seeds: one per environment of the batch, for policies that draw random numbers; not the environments' own
+                (`policy_seeds`).
 
         Raises:
             ValueError: for an environment that the policy can't act in, saying what doesn't fit.
@@ -83,6 +86,11 @@ def describe(env: BatchedEnv | KHopEnv | KHopVectorEnv | JointEnv) -> EnvDescrip
         layouts=dict(zip(batched.agents, batched.layouts, strict=True)),
         action_sizes=dict(zip(batched.agents, sizes.tolist(), strict=True)),
     )
+
+
+def policy_seeds(seeds: Sequence[int]) -> list[int]:
+    """Seeds for a policy's own random numbers in episodes with these seeds, from which it can't tell them."""
+    return [int(np.random.SeedSequence([int(seed), 1]).generate_state(1, np.uint64)[0]) for seed in seeds]
 
 
 def batched_of(env: object) -> BatchedEnv:

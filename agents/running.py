@@ -10,8 +10,8 @@ import numpy as np
 
 from agents.learning.learned import PretrainedPolicy, pretrained_for
 from agents.policies import make_policy
-from agents.policy import Policy, describe
-from khop_env.env import EnvState, KHopEnv
+from agents.policy import Policy, describe, policy_seeds
+from khop_env.env import EnvState, KHopEnv, Settings
 from khop_env.registry import environment_module
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Extremes, Observe, Simulator
@@ -29,12 +29,18 @@ class PolicyRun:
     def __init__(self, env: KHopEnv, policy: Policy, seed: int) -> None:
         self.env, self.policy = env, policy
         self.simulator: Simulator = env.batched.simulator
-        policy.reset(describe(env), [seed])
+        policy.reset(describe(env), policy_seeds([seed]))
         self._observations, _ = env.reset(seed=seed)
         self._extremes = np.zeros((4, 1))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.simulator, name)
+
+    @property
+    def duration(self) -> float:
+        """Of the episode, in s."""
+        settings = self.env.batched.settings
+        return settings.max_cycles * settings.control_period
 
     @property
     def extremes(self) -> Extremes:
@@ -43,7 +49,7 @@ class PolicyRun:
 
     def step(self, dt: float) -> None:
         """One control period, or, when `record` warms up, one short step of the simulator."""
-        if dt < 0.5 * self.env.batched.settings.control_period:
+        if dt < 1e-6:
             self.simulator.step(dt)
             return
         actions: Mapping[str, Any] = self.policy.act(self._observations)
@@ -68,7 +74,7 @@ def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float,
         spec: e.g. "ppo:runs/mine"; "ppo:pretrained" is the shipped one that there is for the scenario.
         scenario: where it acts.
         observe: observation mode.
-        duration: of the episode in s.
+        duration: of the episode in s, rounded up to whole control periods.
         seed: of the episode.
 
     Raises:
@@ -77,7 +83,6 @@ def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float,
     policy = make_policy(spec)
     about = pretrained_for(scenario.name) if isinstance(policy, PretrainedPolicy) else policy.about  # type: ignore[attr-defined]
     make = environment_module(about["environment"]).parallel_env
-    env: KHopEnv = make(scenario, observe=observe, bounds=about["bounds"])
-    cycles = max(1, math.ceil(duration / env.batched.settings.control_period - 1e-9))
-    env = make(scenario, observe=observe, bounds=about["bounds"], max_cycles=cycles)
+    cycles = max(1, math.ceil(duration / Settings.control_period - 1e-9))
+    env: KHopEnv = make(scenario, observe=observe, bounds=about["bounds"], max_cycles=cycles)
     return PolicyRun(env, policy, seed)

@@ -36,9 +36,9 @@ class RandomPolicy:
     """Uniform in [-1, 1], from a generator for each environment of the batch."""
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Seed the generators; the environment's own draw from other streams."""
+        """Seed the generators."""
         self._sizes = env.action_sizes
-        self._generators = [np.random.default_rng([int(seed), 1]) for seed in seeds]
+        self._generators = [np.random.default_rng(int(seed)) for seed in seeds]
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """New numbers for every environment."""

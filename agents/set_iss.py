@@ -21,7 +21,7 @@ from agents.lyapunov import ComparisonGain
 from khop_env.observers import DesignError, Exponential, FloatArray, TargetObservers
 from khop_env.results.metrics import consensus_error
 from khop_env.scenarios import Scenario
-from khop_env.simulation import Law, View
+from khop_env.simulation import Law, Simulator, View
 
 SIZES = tuple(float(f"{size:.3g}") for size in np.geomspace(0.02, 2.0, 7))  # m
 FACTORS = tuple(float(f"{factor:.3g}") for factor in np.geomspace(10.0, 0.1, 7))  # of the scenario's delta(inf)
@@ -29,7 +29,7 @@ PATTERNS = ("constant", "swinging", "adversarial")
 TAIL = 0.5  # of a run, in which ultimate values are taken
 BEGIN = 0.3  # of a run with observers: their transient is over, and the paired oracle run begins
 
-_ROUNDING = 1e-4  # relative: the error of the integrator's step
+_ROUNDING = 1e-4  # relative: errors of the simulator's and of the comparison's steps
 
 Progress = Callable[[float], None]
 
@@ -167,10 +167,10 @@ def swept_bounds(
     Returns:
         A row per factor, kind of observers, and with or without disturbance: observers, disturbed, factor, delta
         (the smallest delta(inf) of a position, in m), error (largest norm of the errors that the law reads, in m),
-        floor, distance, excess (means over episodes of the largest values in the last half after the transient, in m),
-        bound (what the analytical gain allows, in m: without disturbances on the distance, which the comparison
-        equation of `ComparisonGain` bounds from the errors measured; with them on the excess, gamma of the largest
-        error; None where it says nothing), holds (whether every run kept it), normalized (largest |xi| / rho).
+        floor, distance, excess (largest values of all episodes in the last half after the transient, in m), bound (on
+        the distance, in m, by the comparison equation of `ComparisonGain` from the errors and disturbances measured at
+        the steps; None where these are too large for it), holds (whether every run kept it, to a relative 1e-4),
+        normalized (largest |xi| / rho).
 
     Raises:
         ValueError: for bounds that aren't `Exponential`.
@@ -245,50 +245,56 @@ def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
     steps = round(scenario.duration / scenario.dt)
     begin, tail = round(BEGIN * steps), round((1.0 - TAIL * (1.0 - BEGIN)) * steps)
     distance, floor, error, allowed, excess = np.zeros((5, episodes))
-    comparison = None if scenario.disturbance is not None else analytical_gain(scenario)
-    before, kept = np.zeros(episodes), True
+    comparison = analytical_gain(scenario)
+    push = _Push(scenario, episodes)
+    before, kept = np.zeros((2, episodes)), True
     for step in range(steps):
         if step == begin:
             oracle.restore(run.save())
             limit = consensus_error(run.fleet, run.x)
         run.step(scenario.dt)
-        now = np.linalg.norm(run.estimates[:, read] - run.x[:, truth], axis=1)
+        now = np.array([np.linalg.norm(run.estimates[:, read] - run.x[:, truth], axis=1), push(run)])
         if step < begin:
             before = now
             continue
         oracle.step(scenario.dt)
         mine, its = consensus_error(run.fleet, run.x), consensus_error(run.fleet, oracle.x)
-        error = np.maximum(error, now)
+        error = np.maximum(error, now[0])
         if comparison is not None:
-            limit = comparison.step(limit, np.maximum(now, before), scenario.dt)
+            largest = np.maximum(now, before)
+            limit = comparison.step(limit, largest[0], scenario.dt, largest[1])
             kept &= bool(np.all(mine <= limit * (1.0 + _ROUNDING)))
         before = now
         if step >= tail:
-            distance, floor, excess = (
-                np.maximum(distance, mine),
-                np.maximum(floor, its),
-                np.maximum(excess, np.abs(mine - its)),
-            )
-            allowed = np.maximum(allowed, limit)
-    gain = analytical_gain(scenario)
-    bound = None
-    if comparison is not None:
-        bound = _finite(float(allowed.max()))
-    elif gain is not None:
-        bound = _finite(gain.ultimate(float(error.max())))
-        kept = bound is not None and bool(np.all(excess <= bound))
+            distance, floor = np.maximum(distance, mine), np.maximum(floor, its)
+            excess, allowed = np.maximum(excess, np.abs(mine - its)), np.maximum(allowed, limit)
+    bound = None if comparison is None else _finite(float(allowed.max()))
     layout = scenario.design.states.layout
     positions = np.isin(layout.row_source, scenario.fleet.position_index)
     return {
         "delta": min(one.infimum() for one, used in zip(scenario.design.states.bounds, positions, strict=True) if used),
         "error": float(error.max()),
-        "floor": float(floor.mean()),
-        "distance": float(distance.mean()),
-        "excess": float(excess.mean()),
+        "floor": float(floor.max()),
+        "distance": float(distance.max()),
+        "excess": float(excess.max()),
         "bound": bound,
         "holds": None if bound is None else kept,
         "normalized": float(max(run.extremes.normalized.max(), run.extremes.input_normalized.max())),
     }
+
+
+class _Push:
+    """|Pi w| along a run, in m/s."""
+
+    def __init__(self, scenario: Scenario, batch: int) -> None:
+        disturbance = scenario.disturbance
+        self._attached = None if disturbance is None else disturbance.attach(scenario.fleet)
+        self._w, self._none = np.zeros((batch, scenario.fleet.n)), np.zeros(batch)
+
+    def __call__(self, run: Simulator) -> FloatArray:
+        if self._attached is None:
+            return self._none
+        return consensus_error(run.fleet, self._attached(run.t, run.x, run.save().drawn, self._w))
 
 
 def _read_columns(scenario: Scenario) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

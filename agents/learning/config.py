@@ -87,6 +87,8 @@ class TrainingConfig:
         for name in ("learning_rate", "clip_range", "huber"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)!r}")
+        if not 0.0 <= self.entropy < math.inf or not math.isfinite(self.log_std):
+            raise ValueError(f"entropy must not be negative, log_std finite; got {self.entropy!r} and {self.log_std!r}")
         for name in ("gamma", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be from 0 to 1; got {getattr(self, name)!r}")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.learning.scaling import ObservationScaler
+from agents.learning.scaling import RATE, ObservationScaler
 from agents.policy import EnvDescription, Observations
 from khop_env.env.layout import Float32Array
 
@@ -30,6 +30,9 @@ class PolicyFileError(ValueError):
 @dataclass(frozen=True, eq=False)
 class LearnedPolicy:
     """Networks that map features of observations to actions; deterministic, with a memory of one observation at most.
+
+    Where episodes of a batch end at different times, as with autoreset, the first features after an end hold a change
+    that spans both episodes; `reset` forgets the observation before.
 
     Attributes:
         environment: what it was trained for.
@@ -57,14 +60,21 @@ class LearnedPolicy:
         """
         if env.environment != self.environment:
             raise PolicyFileError(f"it was trained for {self.environment}, not for {env.environment}")
-        sizes, columns = set(env.action_sizes.values()), columns_of(env)
-        if len({len(layout) for layout in env.layouts.values()}) > 1 or sizes != {self.action_size}:
+        sizes, columns = sorted(set(env.action_sizes.values())), columns_of(env)
+        where = self.about.get("scenario", "another scenario")
+        if len({len(layout) for layout in env.layouts.values()}) > 1:
+            raise PolicyFileError("it needs uniform observations: make the environment with uniform=True")
+        if sizes != [self.action_size]:
             raise PolicyFileError(
-                f"it needs uniform observations and {self.action_size} entries per action; the environment has "
-                f"{sorted({len(layout) for layout in env.layouts.values()})} columns and {sorted(sizes)} entries"
+                f"it was trained on {where} with {self.action_size} entries per action, here are {sizes}; train one "
+                f"for {env.scenario}"
+            )
+        period = RATE / self.scaler.rate
+        if abs(env.control_period - period) > 1e-9:
+            raise PolicyFileError(
+                f"it was trained to act every {period:g} s, here agents act every {env.control_period:g} s"
             )
         if columns != self.columns:
-            where = self.about.get("scenario", "another scenario")
             pairs = enumerate(zip(self.columns, columns, strict=False))
             differs = next(
                 (f"column {q} is {mine!r} there and {its!r} here" for q, (mine, its) in pairs if mine != its),
@@ -83,7 +93,12 @@ class LearnedPolicy:
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """The networks' outputs, in [-1, 1]."""
         seen = np.stack([observations[agent] for agent in observations])
-        features = self.scaler(seen, self._before)  # type: ignore[attr-defined]
+        before = self.__dict__["_before"]
+        if before is not None and before.shape != seen.shape:
+            raise ValueError(
+                f"observations of another batch, {seen.shape[1:-1]} after {before.shape[1:-1]}: call reset() first"
+            )
+        features = self.scaler(seen, before)
         object.__setattr__(self, "_before", seen)
         if "" in self.networks:
             return dict(zip(observations, self._forward(features, self.networks[""]), strict=True))

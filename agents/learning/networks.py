@@ -22,7 +22,8 @@ class PerTypeExtractor(nn.Module):
     """A network for each type of agent, chosen by the type's one-hot in the observation.
 
     Each type's features stand in a block of their own, with a constant 1, and are zero elsewhere, so that the linear
-    heads which Stable-Baselines3 puts on top are separate for each type, biases included.
+    heads which Stable-Baselines3 puts on top are separate for each type; only a bias that is added to all, and the
+    standard deviation of the exploration, are shared.
 
     Args:
         features: entries of an observation.

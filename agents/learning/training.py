@@ -63,7 +63,7 @@ class Training:
     Attributes:
         policy: the best of all evaluations.
         curve: the evaluations.
-        seconds: of wall time in `learn`, this time.
+        seconds: of wall time in `learn`, those before a resumed checkpoint included.
         finished: whether it came to its end, and wasn't interrupted.
     """
 
@@ -121,11 +121,13 @@ class _Run(BaseCallback):
         self.curve: list[Evaluation] = [] if saved is None else saved["curve"]
         self.best = max((one.mean_return for one in self.curve), default=-np.inf)
         self.interrupted, self.resumed = False, saved is not None
+        self.seconds = 0.0 if saved is None else saved["seconds"]
         if saved is None:
             self.algorithm = make_model(config, self.env, columns, log)  # it seeds the environment, too
             self.env.seed((config.seed + 1) * _FIRST_SEED)
         else:
             self.algorithm = _restore(saved, self, log)
+        self.start = time.perf_counter()
         self.policy = self._exported()
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
@@ -135,7 +137,7 @@ class _Run(BaseCallback):
     def learn(self) -> Training:
         """Train to the end, or to the interrupt."""
         done = self.algorithm.num_timesteps
-        start = time.perf_counter()
+        self.start = time.perf_counter()
         if done < self.config.timesteps:
             try:
                 self.algorithm.learn(
@@ -144,20 +146,20 @@ class _Run(BaseCallback):
                     reset_num_timesteps=not self.resumed,
                     tb_log_name="run",
                 )
-            except KeyboardInterrupt:
-                self.interrupted = True
-            seconds = time.perf_counter() - start
-            if not self.interrupted:
                 self._evaluate()
                 self._save()
-        else:
-            seconds = 0.0
+            except KeyboardInterrupt:
+                self.interrupted = True
         if self.interrupted and self.folder is not None:
             self._exported().save(self.folder / "last.npz")
             if not (self.folder / "best.npz").exists():
                 self._exported().save(self.folder / "best.npz")
         best = self.policy if self.folder is None else LearnedPolicy.load(self.folder / "best.npz")
-        return Training(best, self.curve, seconds, not self.interrupted)
+        return Training(best, self.curve, self.elapsed(), not self.interrupted)
+
+    def elapsed(self) -> float:
+        """Seconds of training so far."""
+        return float(self.seconds + time.perf_counter() - self.start)
 
     def _on_training_start(self) -> None:
         if not self.resumed:
@@ -236,6 +238,7 @@ def _checkpoint(run: _Run) -> dict[str, Any]:
         "last": (model._last_obs, model._last_episode_starts, model._last_original_obs),
         "random": (torch.get_rng_state(), np.random.get_state(), random.getstate()),  # noqa: NPY002
         "curve": run.curve,
+        "seconds": run.elapsed(),
     }
 
 
@@ -263,7 +266,7 @@ def _load(folder: Path | None, config: TrainingConfig) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is of a run with other settings; `timesteps` may be raised.
+        ValueError: if it is of a run with other settings.
     """
     path = None if folder is None else folder / CHECKPOINT
     if path is None or not path.exists():

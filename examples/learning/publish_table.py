@@ -12,8 +12,9 @@ import shutil
 from datetime import date
 from pathlib import Path
 
-from agents.learning import PRETRAINED, pretrained_name
+from agents.learning import PRETRAINED, TrainingConfig, pretrained_name
 from agents.learning.study import EPISODES, SEEDS, TASKS, folder_of, largest_ratio, measure, table, train_all
+from agents.learning.training import EVALUATION_SEEDS
 from agents.policy import describe
 from khop_env.registry import environment_module
 from khop_env.results import learning_curves
@@ -31,22 +32,27 @@ def main() -> None:
     hours = sum(block.seconds for block in blocks) / 3600.0
     ratios = [largest_ratio(block) for block in blocks]
     worst, late, bound = (max(column) for column in zip(*ratios, strict=True))
-    assert max(worst, bound) < 1.0, "the guarantee was broken: that is worth more than a table"
+    kept = "**The guarantee held in every episode**" if max(worst, bound) < 1.0 else "**THE GUARANTEE WAS BROKEN**"
     budgets = ", ".join(f"{task.timesteps / 1e6:g} million on {task.label}" for task in TASKS)
     text = [
         "# Learned policies, measured\n",
         f"Written by `python examples/learning/publish_table.py` on {date.today().isoformat()}: {len(SEEDS)} training "
         f"seeds for each kind of observation, {len(EPISODES)} evaluation episodes, the same for every row and other "
-        f"than those that policies were trained, selected or tuned on. Training took {hours:.1f} hours of one core in "
-        f"all, two runs at a time on a machine with {os.cpu_count()} cores ({platform.machine()}); agent-steps of each "
-        f"run: {budgets}.\n",
+        f"than those that policies were trained, selected or tuned on. The trainings took {hours:.1f} hours of wall "
+        f"time added up, {given.workers} at a time on {os.cpu_count()} shared cores ({platform.machine()}, no GPU); "
+        f"agent-steps of each run: {budgets}. The policy that is played of each run is the best of "
+        f"{TrainingConfig('consensus_v0').evaluations} evaluations on {len(EVALUATION_SEEDS)} further episodes.\n",
         "Returns are means over agents of an episode's sum; ± is the 95 % interval over episodes, of learned policies "
         "after averaging over training seeds. Scripts play with the parameters that `khop tune` found for the "
-        "environment, the scenario and the kind of observation. The policy that is played of each run is the best of "
-        "20 evaluations on 32 further episodes.\n",
-        "**The guarantee held in every episode**, of learned, scripted, random and bang-bang policies alike: largest "
-        f"|e| {worst:.4f} over all time, {late:.4f} after the first quarter of an episode, largest error over its "
-        f"bound {bound:.4f}; all below 1.\n",
+        "environment and the scenario, on estimates (which serve on the truth, too) or on neighbours only. A verdict "
+        "needs intervals over episodes and over training seeds that both exclude 0.\n",
+        f"{kept}, of learned, scripted, random and bang-bang policies alike: largest |e| {worst:.4f} over all time, "
+        f"{late:.4f} after the first quarter of an episode, largest error over its bound {bound:.4f}; the guarantee is "
+        "that all are below 1.\n",
+        "In consensus an agent can meet the others without hearing anybody: it goes to the origin, where initial sets "
+        "are centred. The script `leader_following` does that on neighbours only, and a network can learn it; in plain "
+        "consensus over a connected network estimates are not what decides. They are where a reference is out of "
+        "earshot and moves.\n",
         "![Learning curves](learning.png)\n",
     ]
     for block in blocks:

@@ -23,12 +23,13 @@ def evaluate(
     environment: EnvironmentArgument,
     scenario: EnvironmentScenario = None,
     policies: Annotated[
-        str, typer.Option(help="Names, with parameters after a colon: tanh,linear:gain=2,cancel_drift=true,zero.")
+        str,
+        typer.Option(
+            help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
+            "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones: ppo:FOLDER, ppo:pretrained."
+        ),
     ] = "tanh,linear,zero,random",
-    observe: Annotated[str, typer.Option(help="Observation modes.")] = "estimate,oracle,local",
-    bounds: Annotated[
-        bool, typer.Option("--bounds", help="Observations hold the guaranteed bounds; for policies trained with them.")
-    ] = False,
+    observe: Annotated[str, typer.Option(help="Observation modes: estimate, oracle, local.")] = "estimate,oracle,local",
     episodes: Annotated[int, typer.Option(min=1, help="Of each row, the same for all.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Of the first episode.")] = 0,
     workers: Annotated[int, typer.Option(min=1, help="Processes; the numbers don't depend on how many.")] = 1,
@@ -44,6 +45,8 @@ def evaluate(
         if csv and as_json:
             raise ValueError("--csv and --json: choose one of them")
         if figure is not None:
+            if figure.suffix.lower() not in (".png", ".pdf", ".svg"):
+                raise ValueError(f"--figure {figure}: a figure's name ends in .png, .pdf or .svg")
             figure.parent.mkdir(parents=True, exist_ok=True)  # before anything is played that could be lost
         with Progress(f"playing {environment}") as progress:
             comparison = compare(
@@ -54,7 +57,6 @@ def evaluate(
                 seeds=range(seed, seed + episodes),
                 workers=workers,
                 ray=ray,
-                arguments={"bounds": True} if bounds else None,
                 progress=progress,
             )
     if as_json:

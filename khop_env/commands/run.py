@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -93,11 +93,9 @@ def run(
         simulator: Any
         if learned:
             simulator = policy_run(str(controller), scenario, observe.value, duration, seed)
-            task, dt, stepper = (
-                simulator.env.batched.task,
-                simulator.env.batched.settings.control_period,
-                simulator.integrator,
-            )
+            played = simulator.env.batched
+            task, dt, stepper = played.task, played.settings.control_period, simulator.integrator
+            duration = simulator.duration
         else:
             law = _law(scenario, controller)
             controller, task = law.name, None
@@ -144,9 +142,15 @@ def run(
 
 
 def _law(scenario: Scenario, controller: str | None) -> LawChoice:
+    from agents import LAWS
+    from khop_env.registry import parameters_from_text
     from khop_env.scenarios import LawChoice
 
-    return scenario.law if controller in (None, scenario.law.name) else LawChoice(str(controller))
+    if controller in (None, scenario.law.name):
+        return scenario.law
+    name, _, given = str(controller).partition(":")
+    types = get_type_hints(LAWS[name]) if name in LAWS else {}
+    return LawChoice(name, parameters_from_text(given, types, f"--controller {controller}"))
 
 
 def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int | None:

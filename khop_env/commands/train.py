@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,7 +39,8 @@ def train(
 ) -> None:
     """Train a policy; then play it: khop evaluate ENV --policies ppo:FOLDER.
 
-    Ctrl-C saves and ends; --resume goes on from the last checkpoint as if nothing had happened.
+    Ctrl-C saves the policy and ends. --resume goes on from the last checkpoint (there are twenty in a run) as if
+    nothing had happened; SAC begins with an empty replay buffer.
     """
     with mistakes(), waiting("starting"):
         try:
@@ -72,5 +74,5 @@ def train(
     else:
         say("interrupted; the same command with --resume goes on from the last checkpoint")
     typer.echo(f"policies: {folder / 'best.npz'}, {folder / 'last.npz'}; curve: {folder / 'curve.csv'}")
-    where = training.policy.about["scenario"]
-    typer.echo(f"play it: khop evaluate {environment} --scenario {where} --policies {algo}:{folder}")
+    command = ["khop", "evaluate", environment, *(["--scenario", scenario] if scenario else [])]
+    typer.echo(f"play it: {shlex.join([*command, '--policies', f'{algo}:{folder}'])}")

@@ -35,7 +35,9 @@ def tune(
     with mistakes():
         if everything == (environment is not None) or (everything and scenario is not None):
             raise ValueError("name one environment to tune for, or give --all and neither ENV nor --scenario")
-        names = list(LAWS) if policies is None else [one.strip() for one in policies.split(",")]
+        names = list(LAWS) if policies is None else [one.strip() for one in policies.split(",") if one.strip()]
+        if not names:
+            raise ValueError(f"--policies names none; known: {', '.join(LAWS)}")
         for name in names:
             if name not in LAWS:
                 raise ValueError(f"no law {name!r}; {did_you_mean(name, LAWS)}")

@@ -129,9 +129,7 @@ def _frames(
 ) -> Iterator[NDArray[np.uint8]]:
     for number, k in enumerate(samples):
         largest = max(_largest_ratio(kind, k) for kind in (recording.states, recording.inputs))
-        error = float(
-            consensus_error(recording.fleet, recording.x[k]) if task is None else _task_error(recording, task, k)
-        )
+        error = _task_error(recording, task, k)
         yield renderer.frame(float(recording.time[k]), recording.x[k], recording.states.estimate[k], largest, error)
         if progress is not None:
             progress((number + 1) / len(samples))

@@ -99,7 +99,7 @@ def test_estimates_pay_where_leaders_are_out_of_earshot():
     assert estimate["final_task_error"] < 0.5 * local["final_task_error"]
 
 
-@pytest.mark.parametrize("count", [4, 5, 10, 100])
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 10, 100])
 def test_interval_is_students(count):
     values = np.random.default_rng(count).normal(size=count)
     low, high = stats.t.interval(0.95, count - 1, values.mean(), stats.sem(values))
@@ -144,6 +144,10 @@ def test_mistakes():
         compare("consensus", ["tanh"])
     with pytest.raises(ValueError, match="observe must be one of estimate, oracle, local; got 'orcale'"):
         compare("consensus_v0", ["tanh"], ("orcale",))
+    with pytest.raises(ValueError, match="one observation mode, each once; got \\['local', 'local'\\]"):
+        compare("consensus_v0", ["tanh"], ("local", "local"))
+    with pytest.raises(ValueError, match="one observation mode, each once; got \\[\\]"):
+        compare("consensus_v0", ["tanh"], ())
     with pytest.raises(ValueError, match="no policy 'than'"):
         compare("consensus_v0", ["tanh", "than"])
     with pytest.raises(TypeError, match="expected an environment of khop_env; got int"):

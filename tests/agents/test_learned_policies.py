@@ -150,7 +150,12 @@ def test_a_policy_that_does_not_fit_is_refused(trained, tmp_path):
     policy = trained[0].policy
     for environment, scenario, arguments, said in (
         ("formation_v0", "mixed_fleet", {}, "it was trained for consensus_v0, not for formation_v0"),
-        ("consensus_v0", "paper", {}, "it needs uniform observations and 3 entries per action; the environment has"),
+        (
+            "consensus_v0",
+            "paper",
+            {},
+            "with 3 entries per action, here are .2.; train one for paper",
+        ),
         (
             "consensus_v0",
             "mixed_fleet",
@@ -158,6 +163,7 @@ def test_a_policy_that_does_not_fit_is_refused(trained, tmp_path):
             "trained on mixed_fleet with .* columns of observations, here",
         ),
         ("consensus_v0", "mixed_fleet", {"uniform": False}, "needs uniform observations"),
+        ("consensus_v0", "mixed_fleet", {"control_period": 0.1}, "to act every 0.05 s, here agents act every 0.1 s"),
     ):
         with pytest.raises(PolicyFileError, match=said):
             policy.reset(describe(batched(environment, scenario, num_envs=1, **arguments)), [0])
@@ -166,6 +172,10 @@ def test_a_policy_that_does_not_fit_is_refused(trained, tmp_path):
     (tmp_path / "text.npz").write_text("no policy")
     with pytest.raises(PolicyFileError, match="isn't a policy that khop train wrote"):
         make_policy(f"ppo:{tmp_path / 'text.npz'}")
+    (tmp_path / "mine").mkdir()
+    policy.save(tmp_path / "mine" / "best.npz")
+    with pytest.raises(ValueError, match="was trained by ppo"):
+        make_policy(f"sac:{tmp_path / 'mine'}")
     with pytest.raises(ValueError, match="say which, ppo:FOLDER or ppo:pretrained"):
         make_policy("ppo")
 
@@ -205,7 +215,7 @@ def test_a_learned_policy_is_run_filmed_and_compared(trained, tmp_path):
     assert result.stdout.count(policy[:20]) >= 3
     refused = CliRunner().invoke(app, [*evaluate, "--policies", policy])
     assert refused.exit_code == 2
-    assert "it needs uniform observations and 3 entries per action" in refused.stderr
+    assert "trained on mixed_fleet with 3 entries per action, here are [2]" in refused.stderr
 
 
 SHIPPED = sorted(PRETRAINED.glob("*.npz"))

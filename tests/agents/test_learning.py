@@ -164,5 +164,5 @@ def test_ctrl_c_on_the_command_line(tmp_path):
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 0, stderr
     assert "interrupted; the same command with --resume goes on" in stderr
-    assert f"play it: khop evaluate consensus_v0 --scenario paper --policies ppo:{tmp_path / 'run'}" in stdout
+    assert f"play it: khop evaluate consensus_v0 --policies ppo:{tmp_path / 'run'}" in stdout
     assert LearnedPolicy.load(tmp_path / "run").about["observe"] == "estimate"

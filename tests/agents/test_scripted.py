@@ -118,6 +118,31 @@ def env_observations(env):
     return {agent: env.observe(agent) for agent in env.possible_agents}
 
 
+class Spy:
+    """Tries to rebuild its environment from what it is told, and to read the truth there."""
+
+    def __init__(self):
+        self.twins = []
+
+    def reset(self, env, seeds):
+        twin = batched(env.environment, env.scenario, num_envs=len(seeds), observe=env.observe)
+        self.twins.append(twin.reset(seeds)[0])
+        self.sizes = env.action_sizes
+
+    def act(self, observations):
+        batch = next(iter(observations.values())).shape[0]
+        return {agent: np.zeros((batch, self.sizes[agent])) for agent in observations}
+
+
+def test_a_policy_can_not_rebuild_its_episode():
+    """The seeds that it is given for its own random numbers aren't the environment's."""
+    env, spy = batched("consensus_v0", "convoy", num_envs=3), Spy()
+    play(env, spy, range(3))
+    truth = env.reset(range(3))[0]
+    assert spy.twins[0].shape == truth.shape
+    assert not np.any(np.all(spy.twins[0] == truth, axis=(1, 2)))
+
+
 def test_what_a_policy_is_told_holds_no_environment():
     """No attribute of the description, at any depth, is a simulator, an environment or a state."""
     env = parallel("leader_following_v0", "convoy")
@@ -147,8 +172,9 @@ def test_every_law_makes_progress_everywhere(environment, scenario, law):
     )
     factor = 4.0 if environment == "leader_following_v0" else 20.0
     assert estimate.task_error[0].mean() > factor * estimate.final_task_error.mean()
-    # the opening transient costs up to 0.75 m^2 s; from then on estimates are as good as the truth
-    assert estimate.returns.mean() > 1.05 * oracle.returns.mean() - 0.75
+    # the opening transient costs that much more in m^2 s; from then on estimates are as good as the truth
+    transient = {"consensus_v0": 0.02, "formation_v0": 0.2, "leader_following_v0": 0.75}[environment]
+    assert estimate.returns.mean() > 1.05 * oracle.returns.mean() - transient
     assert estimate.final_task_error.mean() < 1.02 * oracle.final_task_error.mean() + 0.001
     assert estimate.max_normalized_disagreement.max() < 1.0
     assert estimate.max_error_to_bound.max() < 1.0

@@ -29,13 +29,14 @@ env = VecNormalize(
 model = PPO(
     "MlpPolicy",
     env,
-    learning_rate=2e-3,
+    learning_rate=lambda remaining: 2e-3 * remaining,
+    ent_coef=0.02,
     n_steps=8,
     batch_size=1024,
     n_epochs=8,
     gamma=0.95,
     gae_lambda=0.9,
-    policy_kwargs={"net_arch": {"pi": [64, 64], "vf": [64, 64]}, "activation_fn": nn.ReLU},
+    policy_kwargs={"net_arch": {"pi": [64, 64], "vf": [64, 64]}, "activation_fn": nn.ReLU, "log_std_init": 0.5},
     device="cpu",
 )
 model.learn(4_096)
