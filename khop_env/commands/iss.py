@@ -60,10 +60,10 @@ def iss(
     broken = [one for one in verdicts if not one]
     if as_json:
         region = None if gain is None else gain.region()
-        found = {"scenario": scenario.name, "law": scenario.law.name, "analytical_region": region}
+        found: dict[str, Any] = {"scenario": scenario.name, "law": scenario.law.name, "analytical_region": region}
         found["holds"] = all(verdicts) if verdicts else None
-        _print = {**found, "injected": injected, "swept": swept, "slopes": slopes}
-        print_json({**_print, "files": {key: str(path) for key, path in files.items()}})
+        found |= {"injected": injected, "swept": swept, "slopes": slopes}
+        print_json({**found, "files": {key: str(path) for key, path in files.items()}})
     else:
         _print_tables(injected, swept, slopes)
         if gain is None:
