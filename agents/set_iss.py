@@ -26,7 +26,7 @@ from khop_env.simulation import Law, Simulator, View
 SIZES = tuple(float(f"{size:.3g}") for size in np.geomspace(0.02, 2.0, 7))  # m
 FACTORS = tuple(float(f"{factor:.3g}") for factor in np.geomspace(10.0, 0.1, 7))  # of the scenario's delta(inf)
 PATTERNS = ("constant", "swinging", "adversarial")
-TAIL = 0.5  # of a run, in which ultimate values are taken
+TAIL = 0.25  # of a run, in which ultimate values are taken
 BEGIN = 0.3  # of a run with observers: their transient is over, and the paired oracle run begins
 
 _ROUNDING = 1e-4  # relative: errors of the simulator's and of the comparison's steps
@@ -100,9 +100,9 @@ def injected_errors(
         progress: told how far it is.
 
     Returns:
-        A row per size and pattern: error, pattern, distance (the largest in the second half of a run, over the
+        A row per size and pattern: error, pattern, distance (the largest in the last quarter of a run, over the
         episodes), gain (distance over error), bound (what the analytical gain allows in the limit; None where there is
-        none), all in m; and holds (whether every run kept to the comparison equation from where its second half began;
+        none), all in m; and holds (whether every run kept to the comparison equation from where its last quarter began;
         None where that says nothing).
     """
     calm, bound, batch = scenario.replace(disturbance=None), analytical_gain(scenario), episodes * len(PATTERNS)
@@ -123,7 +123,7 @@ def injected_errors(
         for step in range(steps):
             simulator.step(calm.dt)
             now = consensus_error(calm.fleet, simulator.x)
-            if step >= TAIL * steps:
+            if step >= (1.0 - TAIL) * steps:
                 distance = np.maximum(distance, now)
                 if bound is not None:
                     limit = bound.step(limit, np.full(batch, size), calm.dt)
@@ -167,7 +167,7 @@ def swept_bounds(
     Returns:
         A row per factor, kind of observers, and with or without disturbance: observers, disturbed, factor, delta
         (the smallest delta(inf) of a position, in m), error (largest norm of the errors that the law reads, in m),
-        floor, distance, excess (largest values of all episodes in the last half after the transient, in m), bound (on
+        floor, distance, excess (largest values of all episodes in the last quarter of a run, in m), bound (on
         the distance, in m, by the comparison equation of `ComparisonGain` from the errors and disturbances measured at
         the steps; None where these are too large for it), holds (whether every run kept it, to a relative 1e-4),
         normalized (largest |xi| / rho).
@@ -243,7 +243,7 @@ def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
     run.reset(seed)
     read, truth = _read_columns(scenario)
     steps = round(scenario.duration / scenario.dt)
-    begin, tail = round(BEGIN * steps), round((1.0 - TAIL * (1.0 - BEGIN)) * steps)
+    begin, tail = round(BEGIN * steps), round((1.0 - TAIL) * steps)
     distance, floor, error, allowed, excess = np.zeros((5, episodes))
     comparison = analytical_gain(scenario)
     push = _Push(scenario, episodes)
