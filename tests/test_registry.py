@@ -40,7 +40,7 @@ def test_every_scenario_is_complete(name):
 def test_descriptions():
     assert [one["name"] for one in describe()] == list(scenarios())
     assert all(one["description"] for one in describe())
-    assert describe()[-1]["parameters"] == {"agents": 100, "k": 2, "seed": 0}
+    assert describe()[-1]["parameters"] == {"agents": 100, "k": 2, "seed": 0, "rate": 5.0}
 
 
 def test_parameters_of_a_family():

@@ -54,6 +54,7 @@ TASKS = (
     StudyTask("leader_following_v0", "convoy", 1_500_000),
     StudyTask("leader_following_v0", "mixed_fleet", 1_500_000),
     StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000),
+    StudyTask("formation_v0", "random_geometric:agents=12,rate=15", 1_000_000),
 )
 
 VARIANTS: dict[str, dict[str, Any]] = {

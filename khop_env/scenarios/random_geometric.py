@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import networkx as nx
 import numpy as np
 
@@ -11,9 +13,10 @@ from khop_env.scenarios.scenario import LawChoice, Scenario
 
 MEAN_DEGREE = 5.0
 GAIN = 2.0
+RATE = 5.0  # 1/s, the paper's
 
 
-def random_geometric(agents: int = 100, k: int = 2, seed: int = 0) -> Scenario:
+def random_geometric(agents: int = 100, k: int = 2, seed: int = 0, rate: float = RATE) -> Scenario:
     """Single integrators on a random geometric graph, each to agree with its nearest neighbours out of earshot.
 
     Agents are uniform points at unit density, hear each other within the range that makes the mean degree about 5, and
@@ -25,14 +28,17 @@ def random_geometric(agents: int = 100, k: int = 2, seed: int = 0) -> Scenario:
         agents: N, from 4 to 10 000 and more.
         k: agents up to k hops away are estimated, at least 2.
         seed: of the positions, and of who is to agree with whom.
+        rate: at which the bounds on estimates fall, in 1/s.
 
     Raises:
-        ValueError: for fewer than 4 agents, k below 2 or a negative seed.
+        ValueError: for fewer than 4 agents, k below 2, a negative seed or a rate that isn't positive.
     """
     if agents < 4:
         raise ValueError(f"random_geometric needs at least 4 agents; got agents={agents}")
     if seed < 0:
         raise ValueError(f"random_geometric needs a seed that isn't negative; got seed={seed}")
+    if not 0.0 < rate < math.inf:
+        raise ValueError(f"random_geometric needs a positive, finite rate; got rate={rate}")
     rng = np.random.default_rng(seed)
     communication, _ = random_geometric_graph(agents, MEAN_DEGREE, rng)
     task = nx.Graph(nx.bfs_edges(communication, 0))
@@ -43,14 +49,14 @@ def random_geometric(agents: int = 100, k: int = 2, seed: int = 0) -> Scenario:
             task.add_edge(i, int(rng.choice(unheard)))
     most_edges = max(degree for _, degree in task.degree)
     return Scenario(
-        name=f"random_geometric:agents={agents},k={k},seed={seed}",
+        name=f"random_geometric:agents={agents},k={k},seed={seed}" + (f",rate={rate:g}" if rate != RATE else ""),
         description=f"{agents} single integrators on a random geometric graph, k = {k}, seed {seed}",
         models=(SingleIntegrator(input_limit=GAIN * most_edges),) * agents,
         communication=communication,
         task=task,
         k=k,
-        delta=Exponential(1.0, 0.1, 5.0),
-        theta=Exponential(1.0, 1.0, 5.0),
+        delta=Exponential(1.0, 0.1, rate),
+        theta=Exponential(1.0, 1.0, rate),
         disturbance=Sinusoid(0.3, frequency=(0.5, 2.0)),
         radius=1.5,
         law=LawChoice("tanh", {"gain": GAIN}),
