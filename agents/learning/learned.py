@@ -201,7 +201,7 @@ class PretrainedPolicy:
 
 
 def pretrained_name(environment: str, scenario: str) -> str:
-    """File name, without ending, of the shipped policy."""
+    """File name, without ending, of the shipped policy for an environment on a scenario, both by name."""
     return f"{environment}@{scenario.replace(':', '-').replace(',', '-').replace('=', '')}"
 
 

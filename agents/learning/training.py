@@ -8,8 +8,11 @@ import json
 import pickle
 import platform
 import random
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,17 +142,16 @@ class _Run(BaseCallback):
         done = self.algorithm.num_timesteps
         self.start = time.perf_counter()
         if done < self.config.timesteps:
-            try:
+            with self._interruptible():
                 self.algorithm.learn(
                     self.config.timesteps - done,
                     callback=self,
                     reset_num_timesteps=not self.resumed,
                     tb_log_name="run",
                 )
+            if not self.interrupted:
                 self._evaluate()
                 self._save()
-            except KeyboardInterrupt:
-                self.interrupted = True
         if self.interrupted and self.folder is not None:
             self._exported().save(self.folder / "last.npz")
             if not (self.folder / "best.npz").exists():
@@ -166,7 +168,24 @@ class _Run(BaseCallback):
             self._save()  # so that an early interrupt leaves something to go on from
 
     def _on_step(self) -> bool:
-        return True
+        return not self.interrupted
+
+    @contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """Let Ctrl-C end the training after the step that it comes in; a second one is an exception as usual."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def interrupt(*_: object) -> None:
+            self.interrupted = True
+            signal.signal(signal.SIGINT, before)
+
+        before = signal.signal(signal.SIGINT, interrupt)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     def _on_rollout_start(self) -> None:
         """Between updates: the policy is up to date, and the environment stands still."""
