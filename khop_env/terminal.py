@@ -102,7 +102,7 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
     typer.echo(
         f"{summary['scenario']}: {summary['agents']} agents, {summary['pairs']} pairs of observer and target, "
         f"{summary['duration']:.6g} s in steps of {summary['dt']:g} s ({summary['integrator']}, order "
-        f"{summary['order']}), law {summary['controller']} on {observed}, seed {summary['seed']}"
+        f"{summary['order']}), {summary['controller']} on {observed}, seed {summary['seed']}"
     )
     ratios = f"|xi|/rho {_ratio(summary['max_normalized_disagreement'])}, "
     ratios += f"|x_tilde|/delta {_ratio(summary['max_error_to_bound'])}"
@@ -115,8 +115,11 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
         typer.echo(f"guarantee not kept: stopped at t = {summary['duration']:.6g} s; until then largest {ratios}")
     else:
         typer.echo(f"guarantee not kept: largest {ratios} (should be below 1)")
-    error = summary["final_consensus_error"]
-    typer.echo(f"consensus error at the end: {'not finite' if error is None else f'{error:.4g} m'}")
+    if "environment" in summary:
+        typer.echo(f"{summary['environment']}: task error at the end {summary['final_task_error']:.4g} m")
+    else:
+        error = summary["final_consensus_error"]
+        typer.echo(f"consensus error at the end: {'not finite' if error is None else f'{error:.4g} m'}")
     if summary["diverged"]:
         typer.echo(
             "the states grew without bound: it seems that the plant diverged; try a smaller --dt, or another law"

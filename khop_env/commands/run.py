@@ -73,6 +73,7 @@ def run(
     from agents.learning import ALGORITHMS
     from agents.running import policy_run
     from khop_env.results import RunFileError, record, summarize, write_run
+    from khop_env.results.metrics import task_error
     from khop_env.simulation import Explicit, Proximal
 
     explicit = integrator is IntegratorOption.EXPLICIT
@@ -116,6 +117,11 @@ def run(
         controller=str(controller),
         observe=observe.value,
     )
+    if task is not None:
+        summary |= {
+            "environment": f"{task.name}_v0",
+            "final_task_error": task_error(scenario.fleet, recording.x[-1], task),
+        }
     unwritten: RunFileError | None = None
     with mistakes(), waiting(f"writing {folder}"):
         try:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.env import Task, consensus
-from khop_env.results.metrics import consensus_error
+from khop_env.results.metrics import task_error
 from khop_env.results.recording import ObserverRecord, Progress, Recording
 from khop_env.scenarios import Scenario
 
@@ -129,19 +129,10 @@ def _frames(
 ) -> Iterator[NDArray[np.uint8]]:
     for number, k in enumerate(samples):
         largest = max(_largest_ratio(kind, k) for kind in (recording.states, recording.inputs))
-        error = _task_error(recording, task, k)
+        error = task_error(recording.fleet, recording.x[k], task)
         yield renderer.frame(float(recording.time[k]), recording.x[k], recording.states.estimate[k], largest, error)
         if progress is not None:
             progress((number + 1) / len(samples))
-
-
-def _task_error(recording: Recording, task: Task | None, sample: int) -> float:
-    """Mean over agents of the root mean square error along their task edges in one sample, in m; or of agreement."""
-    if task is None:
-        return float(consensus_error(recording.fleet, recording.x[sample]))
-    positions, (own, other) = recording.fleet.positions(recording.x[sample]), task.edges.T
-    misses = ((positions[other] - positions[own] - task.displacement) ** 2).sum(axis=1)
-    return float(np.mean([np.sqrt(misses[own == i].mean()) for i in np.unique(own)]))
 
 
 def _largest_ratio(kind: ObserverRecord, sample: int) -> float:
