@@ -21,6 +21,7 @@ from agents.policy import describe
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 from khop_env.registry import environment_module
+from khop_env.results.metrics import finite
 from khop_env.simulation import Observe
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class Row:
             "mean_return": float(seen.returns.mean()),
             "ci95": interval95(seen.returns),
             "final_task_error": float(seen.final_task_error.mean()),
-            "settling_time": _finite(float(np.median(seen.settling_time))),
+            "settling_time": finite(float(np.median(seen.settling_time))),
             "effort": float(seen.effort.mean()),
             "max_normalized_disagreement": float(seen.max_normalized_disagreement.max()),
             "max_error_to_bound": float(seen.max_error_to_bound.max()),
@@ -212,7 +213,3 @@ def _play_task(task: _Task) -> Episodes:
 def _environment(environment: str, scenario: str, observe: Observe, arguments: _Arguments, batch: int) -> BatchedEnv:
     make: Callable[..., BatchedEnv] = environment_module(environment).batched_env
     return make(scenario, num_envs=batch, observe=observe, **dict(arguments))
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

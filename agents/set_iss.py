@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from agents.laws import make_law
 from agents.lyapunov import ComparisonGain
 from khop_env.observers import DesignError, Exponential, FloatArray, TargetObservers
-from khop_env.results.metrics import consensus_error
+from khop_env.results.metrics import consensus_error, finite
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Law, Simulator, View
 
@@ -132,7 +132,7 @@ def injected_errors(
                 limit = now
             if progress is not None and step % 100 == 0:
                 progress((number + step / steps) / len(sizes))
-        analytical = None if bound is None else _finite(bound.ultimate(size))
+        analytical = None if bound is None else finite(bound.ultimate(size))
         for kind, pattern in enumerate(PATTERNS):
             mine = slice(kind, None, len(PATTERNS))
             worst = float(distance[mine].max())
@@ -268,7 +268,7 @@ def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
         if step >= tail:
             distance, floor = np.maximum(distance, mine), np.maximum(floor, its)
             excess, allowed = np.maximum(excess, np.abs(mine - its)), np.maximum(allowed, limit)
-    bound = None if comparison is None else _finite(float(allowed.max()))
+    bound = None if comparison is None else finite(float(allowed.max()))
     layout = scenario.design.states.layout
     positions = np.isin(layout.row_source, scenario.fleet.position_index)
     return {
@@ -307,7 +307,3 @@ def _read_columns(scenario: Scenario) -> tuple[NDArray[np.int64], NDArray[np.int
                 read.append(slot[i, j] + fleet.position_index[j] - fleet.state_offset[j])
                 truth.append(fleet.position_index[j])
     return np.array(read, np.int64).reshape(-1), np.array(truth, np.int64).reshape(-1)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
