@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.evaluation import Episodes, Progress, play
+from agents.evaluation import Episodes, play
 from agents.learning.learned import LearnedPolicy
 from agents.policies import make_policy
-from agents.policy import describe
+from agents.policy import EnvDescription, describe
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 from khop_env.registry import environment_module
 from khop_env.results.metrics import finite
+from khop_env.results.recording import Progress
 from khop_env.simulation import Observe
 
 if TYPE_CHECKING:
@@ -39,13 +40,18 @@ class Row:
 
     Attributes:
         policy: as it was asked for.
-        observe: the mode.
+        env: where it played.
         episodes: what was measured.
     """
 
     policy: str
-    observe: Observe
+    env: EnvDescription
     episodes: Episodes
+
+    @property
+    def observe(self) -> Observe:
+        """The mode."""
+        return self.env.observe
 
     @property
     def label(self) -> str:
@@ -97,11 +103,7 @@ class Comparison:
         """A tidy data frame, one row per policy, mode and episode."""
         import polars as pl
 
-        where = {"environment": self.environment, "scenario": self.scenario}
-        return pl.concat(
-            pl.DataFrame({**where, "observe": row.observe, "policy": row.policy, **row.episodes.columns()})
-            for row in self.rows
-        )
+        return pl.concat(row.episodes.frame(row.policy, row.env) for row in self.rows)
 
 
 def compare(
@@ -141,14 +143,16 @@ def compare(
     if not policies or not observe or len(set(observe)) < len(observe):
         raise ValueError(f"name at least one policy and one observation mode, each once; got {list(observe)}")
     asked: dict[str, _Arguments] = {}
+    pairs: list[tuple[str, EnvDescription]] = []
     for spec in policies:  # refuses what there isn't, or doesn't fit, before anything is played
         policy = make_policy(spec)
         with_bounds = {"bounds": True} if isinstance(policy, LearnedPolicy) and policy.about.get("bounds") else {}
         asked[spec] = tuple(sorted({**with_bounds, **(arguments or {})}.items()))
         for mode in observe:
-            env = _environment(environment, name, mode, asked[spec], 1)
+            env = describe(_environment(environment, name, mode, asked[spec]))
+            pairs.append((spec, env))
             try:
-                policy.reset(describe(env), [0])
+                policy.reset(env, [0])
             except ValueError as error:
                 raise ValueError(f"policy {spec!r}: {error}") from error
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
@@ -160,9 +164,8 @@ def compare(
         results[number] = result
         if progress is not None:
             progress(done / len(tasks))
-    pairs = [(spec, mode) for spec in policies for mode in observe]
     parts = [results[first : first + len(chunks)] for first in range(0, len(tasks), len(chunks))]
-    rows = [Row(spec, mode, Episodes.joined(mine)) for (spec, mode), mine in zip(pairs, parts, strict=True)]
+    rows = [Row(spec, where, Episodes.joined(mine)) for (spec, where), mine in zip(pairs, parts, strict=True)]
     return Comparison(environment, env.scenario, rows)
 
 
@@ -174,12 +177,12 @@ def interval95(values: FloatArray) -> float | None:
     """
     if len(values) < 2:
         return None
-    if len(values) < 4:
-        t = (12.7062, 4.3027)[len(values) - 2]
-        return t * float(np.std(values, ddof=1)) / math.sqrt(len(values))
     z, n = statistics.NormalDist().inv_cdf(0.975), len(values) - 1
-    t = z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
-    t += (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
+    if n < 3:
+        t = (12.7062, 4.3027)[n - 1]
+    else:
+        t = z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
+        t += (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
     return t * float(np.std(values, ddof=1)) / math.sqrt(len(values))
 
 
@@ -205,11 +208,11 @@ def _run(tasks: Sequence[_Task], workers: int, ray: bool) -> Iterator[tuple[int,
 
 def _play_task(task: _Task) -> Episodes:
     environment, scenario, observe, seeds, arguments, spec = task
-    env = _environment(environment, scenario, observe, arguments, CHUNK)
+    env = _environment(environment, scenario, observe, arguments)
     return play(env, make_policy(spec), seeds, name=spec)
 
 
-@lru_cache(maxsize=4)
-def _environment(environment: str, scenario: str, observe: Observe, arguments: _Arguments, batch: int) -> BatchedEnv:
+@lru_cache(maxsize=6)  # three modes, with and without bounds
+def _environment(environment: str, scenario: str, observe: Observe, arguments: _Arguments) -> BatchedEnv:
     make: Callable[..., BatchedEnv] = environment_module(environment).batched_env
-    return make(scenario, num_envs=batch, observe=observe, **dict(arguments))
+    return make(scenario, num_envs=CHUNK, observe=observe, **dict(arguments))

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from agents.policies import make_policy
-from agents.policy import Policy, batched_of, by_agent, describe, policy_seeds
+from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
+from khop_env.results.recording import Progress
 
 if TYPE_CHECKING:
     import polars as pl
 
 SETTLED = 0.1  # of the initial task error
-Progress = Callable[[float], None]
-"""Called now and then with the fraction that is done."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +59,19 @@ class Episodes:
         }
         return Episodes(**values, time=parts[0].time)
 
-    def columns(self) -> dict[str, np.ndarray]:
-        """One number per episode, by name."""
-        names = [one.name for one in fields(self) if one.name not in ("task_error", "time", "returns", "seed")]
-        return {"seed": self.seed, "return": self.returns, **{name: getattr(self, name) for name in names}}
+    def frame(self, policy: str, env: EnvDescription) -> pl.DataFrame:
+        """A tidy data frame with a row per episode: where it was played, by whom, and one column per number.
+
+        Args:
+            policy: its name.
+            env: where it played.
+        """
+        import polars as pl
+
+        where = {"environment": env.environment, "scenario": env.scenario, "observe": env.observe, "policy": policy}
+        rest = [one.name for one in fields(self) if one.name not in ("task_error", "time", "returns", "seed")]
+        numbers = {"seed": self.seed, "return": self.returns, **{name: getattr(self, name) for name in rest}}
+        return pl.DataFrame({**where, **numbers})
 
 
 def evaluate(
@@ -98,17 +106,7 @@ def evaluate(
     for number, (name, policy) in enumerate(chosen.items()):
         told = None if progress is None else lambda part, n=number: progress((n + part) / len(chosen))
         episodes = play(batched, policy, seeds, name=name, progress=told)
-        frames.append(
-            pl.DataFrame(
-                {
-                    "environment": description.environment,
-                    "scenario": description.scenario,
-                    "observe": description.observe,
-                    "policy": name,
-                    **episodes.columns(),
-                }
-            )
-        )
+        frames.append(episodes.frame(name, description))
     return pl.concat(frames)
 
 

@@ -1,4 +1,4 @@
-"""Scripted policies: the feedback laws on observations, and two that everything has to beat."""
+"""Scripted policies: the feedback laws on observations, two that everything has to beat, and an adversary."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ Two experiments on a scenario's closed loop, whose goal set A is agreement of th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from agents.laws import make_law
 from agents.lyapunov import ComparisonGain
+from khop_env.env import consensus
 from khop_env.observers import DesignError, Exponential, FloatArray, TargetObservers
 from khop_env.results.metrics import consensus_error, finite
+from khop_env.results.recording import Progress
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Law, Simulator, View
 
@@ -30,8 +32,6 @@ TAIL = 0.25  # of a run, in which ultimate values are taken
 BEGIN = 0.3  # of a run with observers: their transient is over, and the paired oracle run begins
 
 _ROUNDING = 1e-4  # relative: errors of the simulator's and of the comparison's steps
-
-Progress = Callable[[float], None]
 
 
 def analytical_gain(scenario: Scenario) -> ComparisonGain | None:
@@ -106,18 +106,16 @@ def injected_errors(
         None where that says nothing).
     """
     calm, bound, batch = scenario.replace(disturbance=None), analytical_gain(scenario), episodes * len(PATTERNS)
+    edges = consensus(calm.fleet, calm.task).edges
+    unheard = np.array([not calm.communication.has_edge(i, j) for i, j in edges.tolist()], bool)
+    x0 = [calm.initial.draw(np.random.default_rng(seed + b // len(PATTERNS))) for b in range(batch)]
+    steps = round(calm.duration / calm.dt)
     rows = []
     for number, size in enumerate(sizes):
-        heard = calm.communication.has_edge
-        edges = sorted([*calm.task.edges, *((j, i) for i, j in calm.task.edges)])
-        unheard = np.array([not heard(i, j) for i, j in edges], bool)
-        law = Misinformed(
-            make_law(calm.law), size, unheard, np.random.default_rng([seed, 2]), batch, calm.fleet.position_dim
-        )
+        rng = np.random.default_rng([seed, 2])  # the same directions for every size
+        law = Misinformed(make_law(calm.law), size, unheard, rng, batch, calm.fleet.position_dim)
         simulator = calm.build(law=law, observe="oracle", batch=batch)
-        x0 = [calm.initial.draw(np.random.default_rng(seed + b // len(PATTERNS))) for b in range(batch)]
         simulator.reset(seed, x0)
-        steps = round(calm.duration / calm.dt)
         distance, kept = np.zeros(batch), np.ones(batch, bool)
         limit = np.full(batch, math.inf)
         for step in range(steps):
@@ -183,15 +181,15 @@ def swept_bounds(
     ]
     rows = []
     for number, (kind, disturbed, factor) in enumerate(designs):
+        if disturbed and scenario.disturbance is None:
+            continue
         variant = with_final_bounds(scenario, factor)
         if kind == "bare":
             variant = variant.replace(
                 observers=(TargetObservers(drift=False, input_observer=False),) * len(variant.models), theta=None
             )
-        if not disturbed or variant.disturbance is None:
+        if not disturbed:
             variant = variant.replace(disturbance=None)
-        if disturbed and scenario.disturbance is None:
-            continue
         try:
             measured = _paired(variant, episodes, seed)
         except DesignError as error:
@@ -246,14 +244,14 @@ def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
     begin, tail = round(BEGIN * steps), round((1.0 - TAIL) * steps)
     distance, floor, error, allowed, excess = np.zeros((5, episodes))
     comparison = analytical_gain(scenario)
-    push = _Push(scenario, episodes)
+    push = _Push(scenario, run)
     before, kept = np.zeros((2, episodes)), True
     for step in range(steps):
         if step == begin:
             oracle.restore(run.save())
             limit = consensus_error(run.fleet, run.x)
         run.step(scenario.dt)
-        now = np.array([np.linalg.norm(run.estimates[:, read] - run.x[:, truth], axis=1), push(run)])
+        now = np.array([np.linalg.norm(run.estimates[:, read] - run.x[:, truth], axis=1), push()])
         if step < begin:
             before = now
             continue
@@ -284,26 +282,26 @@ def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
 
 
 class _Push:
-    """|Pi w| along a run, in m/s."""
+    """|Pi w| along a run that has been reset, in m/s."""
 
-    def __init__(self, scenario: Scenario, batch: int) -> None:
-        disturbance = scenario.disturbance
+    def __init__(self, scenario: Scenario, run: Simulator) -> None:
+        disturbance, self._run = scenario.disturbance, run
         self._attached = None if disturbance is None else disturbance.attach(scenario.fleet)
-        self._w, self._none = np.zeros((batch, scenario.fleet.n)), np.zeros(batch)
+        self._drawn, self._w = run.save().drawn, np.zeros(run.x.shape)
 
-    def __call__(self, run: Simulator) -> FloatArray:
-        if self._attached is None:
-            return self._none
-        return consensus_error(run.fleet, self._attached(run.t, run.x, run.save().drawn, self._w))
+    def __call__(self) -> FloatArray:
+        run = self._run
+        if self._attached is not None:
+            self._attached(run.t, run.x, self._drawn, self._w)
+        return consensus_error(run.fleet, self._w)
 
 
 def _read_columns(scenario: Scenario) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Columns of the estimates that the law reads, and of the states that they are estimates of."""
     fleet, slot = scenario.fleet, scenario.design.states.layout.slot
     read, truth = [], []
-    for one, other in scenario.task.edges:
-        for i, j in ((one, other), (other, one)):
-            if not scenario.communication.has_edge(i, j):
-                read.append(slot[i, j] + fleet.position_index[j] - fleet.state_offset[j])
-                truth.append(fleet.position_index[j])
+    for i, j in consensus(fleet, scenario.task).edges.tolist():
+        if not scenario.communication.has_edge(i, j):
+            read.append(slot[i, j] + fleet.position_index[j] - fleet.state_offset[j])
+            truth.append(fleet.position_index[j])
     return np.array(read, np.int64).reshape(-1), np.array(truth, np.int64).reshape(-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ class PolicyFileError(ValueError):
     """A policy that can't be read, or doesn't fit; the message says which file and what is wrong."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LearnedPolicy:
     """Networks that map features of observations to actions; deterministic, with a memory of one observation at most.
 
@@ -51,6 +51,8 @@ class LearnedPolicy:
     networks: Mapping[str, Layers]
     scaler: ObservationScaler
     about: Mapping[str, Any]
+    _types: dict[str, str] = field(default_factory=dict, init=False, repr=False)
+    _before: Float32Array | None = field(default=None, init=False, repr=False)
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Check that it was trained for this environment's observations and actions.
@@ -87,24 +89,22 @@ class LearnedPolicy:
         types = {model.type for model in env.models.values()}
         if "" not in self.networks and (missing := types - set(self.networks)):
             raise PolicyFileError(f"it has no network for agents of type {', '.join(sorted(missing))}")
-        object.__setattr__(self, "_types", {agent: model.type for agent, model in env.models.items()})
-        object.__setattr__(self, "_before", None)
+        self._types, self._before = {agent: model.type for agent, model in env.models.items()}, None
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """The networks' outputs, in [-1, 1]."""
         seen = np.stack([observations[agent] for agent in observations])
-        before = self.__dict__["_before"]
+        before = self._before
         if before is not None and before.shape != seen.shape:
             raise ValueError(
                 f"observations of another batch, {seen.shape[1:-1]} after {before.shape[1:-1]}: call reset() first"
             )
         features = self.scaler(seen, before)
-        object.__setattr__(self, "_before", seen)
+        self._before = seen
         if "" in self.networks:
             return dict(zip(observations, self._forward(features, self.networks[""]), strict=True))
-        types: dict[str, str] = self._types  # type: ignore[attr-defined]
         return {
-            agent: self._forward(mine, self.networks[types[agent]])
+            agent: self._forward(mine, self.networks[self._types[agent]])
             for agent, mine in zip(observations, features, strict=True)
         }
 

@@ -130,7 +130,6 @@ class _Run(BaseCallback):
             self.env.seed((config.seed + 1) * _FIRST_SEED)
         else:
             self.algorithm = _restore(saved, self, log)
-        self.start = time.perf_counter()
         self.policy = self._exported()
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
@@ -197,6 +196,8 @@ class _Run(BaseCallback):
             self.told(now / self.config.timesteps, None)
 
     def _evaluate(self) -> None:
+        if self.curve and self.curve[-1].timesteps == self.algorithm.num_timesteps:
+            return
         policy = self._exported()
         episodes = play(self.judge, policy, EVALUATION_SEEDS, name=self.config.algorithm)
         found = Evaluation(
@@ -205,8 +206,6 @@ class _Run(BaseCallback):
             float(episodes.final_task_error.mean()),
             float(episodes.max_normalized_disagreement.max()),
         )
-        if self.curve and self.curve[-1].timesteps == found.timesteps:
-            return
         self.curve.append(found)
         self.algorithm.logger.record("eval/mean_return", found.mean_return)
         self.algorithm.logger.record("eval/final_task_error", found.final_task_error)

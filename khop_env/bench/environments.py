@@ -143,7 +143,19 @@ def _single(order: int) -> Rate:
 
 
 def _peer_rate(python: Path, peer: str, batch: int, threads: int, seconds: float) -> float:
-    command = [str(python), str(PEERS / f"{peer}_rate.py"), str(batch), str(threads), str(seconds)]
+    return run_peer(python, f"{peer}_rate.py", batch, threads, seconds, threads=threads)
+
+
+def run_peer(python: Path, script: str, *arguments: float, threads: int = 1) -> float:
+    """Agent-steps per second that a script of `peers/` prints.
+
+    Args:
+        python: of the environment that the peer is installed in.
+        script: its file name.
+        arguments: of the script.
+        threads: that the peer's own libraries may use.
+    """
+    command = [str(python), str(PEERS / script), *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     return float(json.loads(done.stdout.splitlines()[-1])["agent_steps_per_s"])

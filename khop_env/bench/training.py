@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import os
 import statistics
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-PEERS = Path(__file__).parent / "peers"
+from khop_env.bench.environments import run_peer
+
 TURNS = 3  # the two sides of the ratio take turns, so that the machine's mood meets both
 
 
@@ -61,23 +59,17 @@ def training_rows(add: Callable[..., None], quick: bool, say: Callable[[str], No
     timesteps = 8_192 if quick else 200_000
     say("training: PPO, 64 environments of 8 agents")
     python = None if peers is None else peers / "mpe2" / "bin" / "python"
-    compared = python is not None and python.exists()
+    if python is not None and not python.exists():
+        python = None
     mine, theirs, shares = [], [], []
-    for _ in range(TURNS if compared and not quick else 1):
+    for _ in range(TURNS if python is not None and not quick else 1):
         rate, share = training_rate(timesteps)
         mine.append(rate)
         shares.append(share)
-        if compared:
-            theirs.append(_peer_rate(str(python), 8_192 if quick else 40_960))
+        if python is not None:
+            theirs.append(run_peer(python, "mpe2_train.py", 8_192 if quick else 40_960))
     add("training", statistics.median(mine), "agent-steps/s in learn")
     add("training_environment_share", statistics.median(shares), "of the wall time", "at most 0.3")
     if theirs:
         ratio = statistics.median(mine) / statistics.median(theirs)
         add("training_ratio", ratio, "x MPE2 simple_spread, SuperSuit, the same PPO", "at least 3")
-
-
-def _peer_rate(python: str, timesteps: int) -> float:
-    command = [python, str(PEERS / "mpe2_train.py"), str(timesteps)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    return float(json.loads(done.stdout.splitlines()[-1])["agent_steps_per_s"])
