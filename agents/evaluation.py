@@ -129,28 +129,28 @@ def play(
     if not len(seeds):
         raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
     parts = []
-    for first in range(0, len(seeds), batched.batch):
-        mine = [int(seed) for seed in seeds[first : first + batched.batch]]
-        filled = mine + [mine[-1]] * (batched.batch - len(mine))
+    for first in range(0, len(seeds), batched.num_envs):
+        mine = [int(seed) for seed in seeds[first : first + batched.num_envs]]
+        filled = mine + [mine[-1]] * (batched.num_envs - len(mine))
         try:
             parts.append(_play(batched, policy, filled, len(mine)))
         except ValueError as error:
             raise ValueError(f"policy {name!r} in {batched.task.name}_v0: {error}") from error
         if progress is not None:
-            progress(min(1.0, (first + batched.batch) / len(seeds)))
+            progress(min(1.0, (first + batched.num_envs) / len(seeds)))
     return Episodes.joined(parts)
 
 
 def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Episodes:
     """One batch of episodes, of which the first `count` are kept."""
     horizon, period = env.settings.max_cycles, env.settings.control_period
-    error, returns, effort = np.zeros((horizon + 1, env.batch)), np.zeros(env.batch), np.zeros(env.batch)
-    worst, late, bound = (np.zeros(env.batch) for _ in range(3))
+    error, returns, effort = np.zeros((horizon + 1, env.num_envs)), np.zeros(env.num_envs), np.zeros(env.num_envs)
+    worst, late, bound = (np.zeros(env.num_envs) for _ in range(3))
     inputs = np.array([env.fleet.models[env.fleet.agent(agent)].m for agent in env.agents])
     policy.reset(describe(env), policy_seeds(seeds))
     observations, infos = env.reset(seeds)
     error[0] = infos["task_error"].mean(axis=1)
-    running, length = np.ones(env.batch, bool), np.full(env.batch, horizon)
+    running, length = np.ones(env.num_envs, bool), np.full(env.num_envs, horizon)
     for cycle in range(1, horizon + 1):
         actions = policy.act(by_agent(env, observations))
         given = _stacked(env, actions)
@@ -174,7 +174,7 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
             error[cycle + 1 :] = error[cycle]
             break
         if over.any():  # they can't be left standing; what they do from here on isn't counted
-            observations, _ = env.reset(copies=np.flatnonzero(over))
+            observations, _ = env.reset(env_ids=np.flatnonzero(over))
     settled = error <= SETTLED * error[0]
     unsettled = np.where(settled.all(axis=0), 0, horizon + 1 - np.argmin(settled[::-1], axis=0))
     settling = np.where(unsettled > horizon, np.inf, unsettled * period)
@@ -204,8 +204,8 @@ def _stacked(env: BatchedEnv, actions: Mapping[str, Any]) -> np.ndarray:
     for agent, size in zip(env.agents, sizes, strict=True):
         if agent not in actions:
             raise ValueError(f"no action for {agent!r}; got some for {', '.join(list(actions)[:8]) or 'nobody'}")
-        if np.shape(actions[agent]) != (env.batch, size):
+        if np.shape(actions[agent]) != (env.num_envs, size):
             raise ValueError(
-                f"actions of {agent!r} must have shape {(env.batch, size)}; got {np.shape(actions[agent])}"
+                f"actions of {agent!r} must have shape {(env.num_envs, size)}; got {np.shape(actions[agent])}"
             )
     return np.concatenate([actions[agent] for agent in env.agents], axis=1)

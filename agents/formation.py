@@ -38,7 +38,6 @@ class FormationLaw(VelocityLaw):
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
         """The mean displacement, shortened."""
         sum_edges(self.gain, False, view.edges, displacement, velocity)
-        known = np.bincount(view.edges[view.known, 0], minlength=len(velocity))
-        velocity /= np.maximum(known, 1)[:, None, None]
+        velocity /= np.maximum(view.known_edges(), 1)[:, None]
         length = np.sqrt((velocity * velocity).sum(axis=1, keepdims=True))
         velocity *= self.speed / np.maximum(length, self.speed)

@@ -44,7 +44,7 @@ class LeaderFollowingLaw(VelocityLaw):
         """Towards the shrunk target."""
         agents = len(velocity)
         edges = np.bincount(view.edges[:, 0], minlength=agents)[:, None, None]
-        known = np.bincount(view.edges[view.known, 0], minlength=agents)[:, None, None]
+        known = view.known_edges()[:, None]
         position = view.fleet.positions(view.x).transpose(1, 2, 0)
         sum_edges(1.0, False, view.edges, displacement, velocity)  # sum over known edges of q - p
         velocity += known * position

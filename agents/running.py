@@ -12,9 +12,10 @@ from agents.learning.learned import PretrainedPolicy, pretrained_for
 from agents.policies import make_policy
 from agents.policy import Policy, describe, policy_seeds
 from khop_env.env import EnvState, KHopEnv, Settings
+from khop_env.observers import Extremes
 from khop_env.registry import environment_module
 from khop_env.scenarios import Scenario
-from khop_env.simulation import Extremes, Observe, Simulator
+from khop_env.simulation import Observe, Simulator
 
 
 class PolicyRun:

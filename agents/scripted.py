@@ -148,7 +148,7 @@ class _Reader:
         batch = len(flat)
         if old is None or len(old.x) != batch:
             columns = np.zeros((len(self._edges), self._fleet.position_dim, batch))
-            known = np.zeros(len(self._edges), bool)
+            known = np.zeros((batch, len(self._edges)), bool)
             old = View(self._fleet, np.zeros((batch, self._fleet.n)), self._edges, known, columns.transpose(2, 0, 1))
         values = flat.T
         for component, column in self._value:
@@ -156,7 +156,7 @@ class _Reader:
         for component, cos, sin in self._angle:
             old.x[:, component] = np.arctan2(values[sin], values[cos])
         valid = values[self._valid] > 0.5
-        old.known[...] = valid.all(axis=1)
+        old.known[...] = valid.T
         displacement = old.displacement.transpose(1, 2, 0)
         displacement[...] = values[self._position]
         displacement -= values[self._wanted]

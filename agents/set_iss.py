@@ -114,7 +114,7 @@ def injected_errors(
     for number, size in enumerate(sizes):
         rng = np.random.default_rng([seed, 2])  # the same directions for every size
         law = Misinformed(make_law(calm.law), size, unheard, rng, batch, calm.fleet.position_dim)
-        simulator = calm.build(law=law, observe="oracle", batch=batch)
+        simulator = calm.build(law=law, observe="oracle", num_envs=batch)
         simulator.reset(seed, x0)
         distance, kept = np.zeros(batch), np.ones(batch, bool)
         limit = np.full(batch, math.inf)
@@ -236,7 +236,7 @@ def with_final_bounds(scenario: Scenario, factor: float) -> Scenario:
 def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
     """Runs on estimates, and from their states after the transient runs on the truth."""
     run, oracle = (
-        scenario.build(law=make_law(scenario.law), observe=mode, batch=episodes) for mode in ("estimate", "oracle")
+        scenario.build(law=make_law(scenario.law), observe=mode, num_envs=episodes) for mode in ("estimate", "oracle")
     )
     run.reset(seed)
     read, truth = _read_columns(scenario)

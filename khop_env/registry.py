@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 import numpy as np
 
 from khop_env.env import BatchedEnv, JointEnv, KHopVectorEnv, Settings, Task
+from khop_env.observers import Proximal
 from khop_env.physics import did_you_mean
 from khop_env.scenarios.convoy import convoy
 from khop_env.scenarios.mixed_fleet import mixed_fleet
 from khop_env.scenarios.paper import paper
 from khop_env.scenarios.random_geometric import random_geometric
 from khop_env.scenarios.scenario import Scenario
-from khop_env.simulation import Proximal
 
 if TYPE_CHECKING:
     from khop_env.env.sb3 import KHopSB3VecEnv
@@ -124,7 +124,7 @@ def assemble(
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ValueError(f"num_envs must be a positive integer; got {num_envs!r}")
     chosen = scenario_or_name if isinstance(scenario_or_name, Scenario) else scenario(scenario_or_name)
-    simulator = chosen.build(integrator=Proximal(settings.order, settings.threads), batch=int(num_envs))
+    simulator = chosen.build(observers=Proximal(settings.order, settings.threads), num_envs=int(num_envs))
     return BatchedEnv(simulator, task(chosen), settings, chosen.name)
 
 

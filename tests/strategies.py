@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 from hypothesis import strategies as st
 
-from khop_env.observers import Exponential, Funnels, ObserverDesign, PairLayout, TargetObservers
+from khop_env.observers import Exponential, Funnels, ObserverDesign, Observers, PairLayout, TargetObservers
 from khop_env.physics import (
     BandLimitedNoise,
     Coupling,
@@ -25,7 +25,7 @@ from khop_env.physics import (
     SurfaceVessel,
     Unicycle,
 )
-from khop_env.simulation import InitialSet, Integrator, Simulator, View
+from khop_env.simulation import InitialSet, Simulator, View
 
 SEEDS = st.integers(0, 2**32 - 1)
 PLANAR = (
@@ -64,8 +64,7 @@ def definition_of_m(graph: nx.Graph, members: list[int], target: int, relay: boo
 
 def observers_of(layout: PairLayout, index: int) -> list[int]:
     """The agents that estimate `layout.target[index]`, in the layout's order."""
-    eta, *_, pair = layout.plan[index].tolist()
-    return layout.observer[pair : pair + eta].tolist()
+    return layout.observer[layout.blocks[index].pairs].tolist()
 
 
 # -- strategies ----------------------------------------------------------------------------------------------------
@@ -118,15 +117,15 @@ class System:
     thetas: dict[int, list[Exponential]]
     seed: int
 
-    def simulator(self, integrator: Integrator, batch: int = 1, **options: object) -> Simulator:
+    def simulator(self, observers: Observers, num_envs: int = 1, **options: object) -> Simulator:
         """A simulator of this system, reset with its seed."""
         simulator = Simulator(
             self.design,
             self.initial,
             disturbance=self.disturbance,
             task=self.task,
-            integrator=integrator,
-            batch=batch,
+            observers=observers,
+            num_envs=num_envs,
             **options,
         )
         return simulator.reset(self.seed)
@@ -140,10 +139,11 @@ def fitting(
     """
     smallest = np.maximum(funnels.smallest_initial_bound(radius), 2.0 * floor)
     bounds: dict[int, list[Exponential]] = {}
-    for target, (_, n, _, _, row, _) in zip(funnels.layout.target.tolist(), funnels.layout.plan.tolist(), strict=True):
-        initial = smallest[row : row + n] * np.exp(rng.uniform(np.log(margin), np.log(5.0), n))
+    for block in funnels.layout.blocks:
+        n = block.components
+        initial = smallest[block.rows] * np.exp(rng.uniform(np.log(margin), np.log(5.0), n))
         final = initial * np.exp(rng.uniform(np.log(floor / initial), 0.0))
-        bounds[target] = [Exponential(a, b, rng.uniform(0.2, 8.0)) for a, b in zip(initial, final, strict=True)]
+        bounds[block.agent] = [Exponential(a, b, rng.uniform(0.2, 8.0)) for a, b in zip(initial, final, strict=True)]
     return bounds
 
 

@@ -5,19 +5,19 @@ import numpy as np
 from agents import make_law
 from khop_env.bench import benchmark, environments
 from khop_env.bench.yardsticks import CompiledPaper
+from khop_env.observers import Explicit
 from khop_env.scenarios import paper
-from khop_env.simulation import Explicit
 
 
 def test_compiled_explicit_loop_equals_the_explicit_integrator():
     scenario = paper()
-    simulator = scenario.build(law=make_law(scenario.law), integrator=Explicit(), batch=3)
+    simulator = scenario.build(law=make_law(scenario.law), observers=Explicit(), num_envs=3)
     loop = CompiledPaper(simulator)
     for _ in range(200):
         simulator.step(1e-5)
     loop.run(1e-5, 200)
     state = simulator.save()
-    for ours, theirs in zip(loop.z, (state.x, state.estimate, state.input_estimate), strict=True):
+    for ours, theirs in zip(loop.z, (state.x, state.memory["estimate"], state.memory["input_estimate"]), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-12)
 
 

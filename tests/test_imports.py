@@ -110,7 +110,7 @@ def test_ranks_name_existing_rooms_in_the_architecture_s_order() -> None:
     assert len(set(names)) == len(names)
     for name in MODULES:
         assert name == "khop_env" or rank(name) >= 0
-    assert rank("khop_env.physics.graph") < rank("khop_env.observers") < rank("khop_env.simulation.proximal")
+    assert rank("khop_env.physics.graph") < rank("khop_env.observers") < rank("khop_env.simulation.plant")
     assert rank("khop_env.scenarios.paper") < rank("agents.laws") < rank("khop_env.cli")
 
 

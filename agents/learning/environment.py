@@ -54,7 +54,7 @@ class TrainingVecEnv(VecEnvWrapper):
         """Start new, staggered episodes."""
         self.before = np.asarray(self.venv.reset())
         state, horizon = self.batched.get_state(), self.batched.settings.max_cycles
-        staggered = np.arange(self.batched.batch) * horizon // self.batched.batch
+        staggered = np.arange(self.batched.num_envs) * horizon // self.batched.num_envs
         self.batched.set_state(dataclasses.replace(state, cycles=staggered))
         return self.scaler(self.before, None)
 

@@ -22,10 +22,10 @@ from agents import make_law
 from khop_env.bench.environments import environment_rows
 from khop_env.bench.training import training_rows
 from khop_env.bench.yardsticks import CompiledPaper, bare_loop
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, Proximal
+from khop_env.observers.solve import solve
 from khop_env.scenarios import Scenario, paper, random_geometric
-from khop_env.simulation import Proximal, Simulator
-from khop_env.simulation.proximal import solve
+from khop_env.simulation import Simulator
 
 DURATION = 10.0  # s, of the closed loop
 ACCURACY = 2e-3  # largest error of x that a method may make over it
@@ -75,7 +75,7 @@ def _best(action: Callable[[], object], repeats: int) -> float:
 
 
 def _simulator(scenario: Scenario, batch: int, order: int = 2) -> Simulator:
-    return scenario.build(law=make_law(scenario.law), integrator=Proximal(order), batch=batch)
+    return scenario.build(law=make_law(scenario.law), observers=Proximal(order), num_envs=batch)
 
 
 def _run(simulator: Simulator, dt: float, duration: float, watch: Callable[[FloatArray], object] | None = None) -> None:
@@ -173,23 +173,22 @@ def _ratio_to_floor(quick: bool, batch: int = 1024) -> float:
     simulator = _simulator(paper(), 16 if quick else batch)
     for _ in range(5):
         simulator.step(DT)
-    layout, state = simulator.design.states.layout, simulator._state
-    arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
+    layout, state = simulator.design.states.layout, simulator.state
     tau = DT * (1.0 - 1.0 / np.sqrt(2.0))
-    whole = (0, simulator.batch), (0, len(layout.plan))
-    rho = np.empty((layout.rows, simulator.batch))
-    estimate, slope = np.empty_like(state.estimate), np.empty_like(state.estimate)
+    whole = (0, simulator.num_envs), (0, len(layout.target))
+    rho = np.empty((layout.rows, simulator.num_envs))
+    estimate, slope = np.empty_like(state.memory["estimate"]), np.empty_like(state.memory["estimate"])
     seconds, evaluations = 0.0, 0
     for _ in range(3 if quick else 50):  # along a run, so that the warm starts are those of one
         simulator.step(DT)
-        predictor, eps = state.estimate + tau * DT, state.eps.copy()
+        predictor, eps = state.memory["estimate"] + tau * DT, state.memory["eps"].copy()
         simulator.design.states.rho.evaluate(state.t, rho)
         start = time.perf_counter()
-        count, failed, _ = solve(*arrays, tau, predictor, state.x, rho, eps, estimate, slope, *whole)
+        count, failed, _ = solve(layout.arrays, tau, predictor, state.x, rho, eps, estimate, slope, *whole)
         seconds += time.perf_counter() - start
         evaluations += count
         assert failed < 0
-    elements = layout.size * simulator.batch
+    elements = layout.size * simulator.num_envs
     return (seconds / evaluations) / (_bare_time(elements, 20) / (20 * elements))
 
 

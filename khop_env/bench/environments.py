@@ -55,7 +55,7 @@ def batched(scenario: str, order: int, threads: int, batch: int = BATCH) -> tupl
     def step(number: int) -> None:
         _, _, terminated, truncated, _ = env.step(pool[number % len(pool)])
         if (terminated | truncated).any():
-            env.reset(copies=np.flatnonzero(terminated | truncated))
+            env.reset(env_ids=np.flatnonzero(terminated | truncated))
 
     return env, step
 
@@ -71,11 +71,12 @@ def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str
     for number in range(5):
         step(number)
     simulator: Any = env.simulator
-    integrator, loop = simulator.integrator, simulator.integrator._loop
+    observers = simulator.observers
     spent: dict[str, float] = {}
     for name, holder, attributes in (
-        ("solve", integrator, ("_solve_states", "_solve_inputs")),
-        ("right-hand sides", loop, ("plant", "belief", "actuate")),
+        ("solve", observers, ("_solve_states", "_solve_inputs")),
+        ("right-hand sides", simulator.plant, ("rate", "actuate")),
+        ("right-hand sides", observers._prediction, ("rate",)),
         ("observation", env, ("_read_observations",)),
     ):
         for attribute in attributes:
@@ -85,7 +86,7 @@ def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str
         step(number)
     total = time.perf_counter() - start
     spent["rest, Python and NumPy"] = total - sum(spent.values())
-    return {name: seconds / (steps * env.batch) * 1e6 for name, seconds in spent.items()}
+    return {name: seconds / (steps * env.num_envs) * 1e6 for name, seconds in spent.items()}
 
 
 def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str], None], peers: Path | None) -> None:

@@ -48,11 +48,11 @@ def closed_loop_derivative(
         for env in range(x.shape[1]):
             dx[column, env] += g[column, env] + w[env, column]
     exponentials(t, funnels[3], funnels[4], funnels[5], rho)
-    disagreement(inputs[0], inputs[1], inputs[2], inputs[3], inputs[4], ghat, g, xi)
-    correction(inputs[0], xi, rho, e, dghat)
+    disagreement(inputs, ghat, g, xi)
+    correction(inputs, xi, rho, e, dghat)
     exponentials(t, funnels[0], funnels[1], funnels[2], rho)
-    disagreement(states[0], states[1], states[2], states[3], states[4], y, x, xi)
-    correction(states[0], xi, rho, e, dy)
+    disagreement(states, y, x, xi)
+    correction(states, xi, rho, e, dy)
     drifting_integrator_drift(y, xi)
     for column in range(y.shape[0]):
         for env in range(y.shape[1]):
@@ -92,20 +92,20 @@ class CompiledPaper:
     """
 
     def __init__(self, simulator: Simulator) -> None:
-        loop, state = simulator._loop, simulator._state
-        views, law = loop.views, loop.law
+        plant, state, design = simulator.plant, simulator.state, simulator.design
+        views, law = plant.views, plant.law
         assert views is not None
         assert isinstance(law, TanhConsensus)
-        assert loop.disturbance is not None
-        _, channels, part = loop.disturbance._parts[0]
-        pairs, batch = loop.state_layout.size, simulator.batch
+        assert plant.disturbance is not None
+        _, channels, part = plant.disturbance._parts[0]
+        pairs, batch = design.states.layout.size, simulator.num_envs
         self.t = state.t.copy()
-        self.z = (state.x.copy(), state.estimate.copy(), state.input_estimate.copy())
+        self.z = (state.x.copy(), state.memory["estimate"].copy(), state.memory["input_estimate"].copy())
         self._dz = tuple(np.zeros_like(block) for block in self.z)
         self._constants = (
-            loop.state_layout.arrays,
-            loop.input_layout.arrays,
-            (*loop.rho.coefficients, *loop.omega.coefficients),
+            design.states.layout.arrays,
+            design.inputs.layout.arrays,
+            (*design.states.rho.coefficients, *design.inputs.rho.coefficients),
             (np.ascontiguousarray(state.drawn[:, part]), channels.index, channels.amplitude),
             (law.gain, views.view.edges, *views.sources),
         )
@@ -113,7 +113,7 @@ class CompiledPaper:
             np.zeros((len(views.view.edges), 2, batch)),
             np.zeros((len(simulator.fleet), 2, batch)),
             *(np.zeros((pairs, batch)) for _ in range(2)),
-            np.zeros((loop.state_layout.rows, batch)),
+            np.zeros((design.states.layout.rows, batch)),
             np.zeros((batch, simulator.fleet.n)),
         )
 

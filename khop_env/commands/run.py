@@ -54,7 +54,7 @@ def run(
         float | None,
         typer.Option(help=f"Step in seconds; by default the scenario's, or {EXPLICIT_STEP:g} for explicit."),
     ] = None,
-    integrator: Annotated[IntegratorOption, typer.Option(help="Integrator.")] = IntegratorOption.PROXIMAL,
+    integrator: Annotated[IntegratorOption, typer.Option(help="Observers.")] = IntegratorOption.PROXIMAL,
     order: Annotated[OrderOption | None, typer.Option(help="Of the proximal integrator; the scenario's.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the initial state and the disturbance.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for the files; by default runs/SCENARIO.")] = None,
@@ -72,9 +72,9 @@ def run(
     from agents import make_law
     from agents.learning import ALGORITHMS
     from agents.running import policy_run
+    from khop_env.observers import Explicit, Proximal
     from khop_env.results import RunFileError, record, summarize, write_run
     from khop_env.results.metrics import task_error
-    from khop_env.simulation import Explicit, Proximal
 
     explicit = integrator is IntegratorOption.EXPLICIT
     with mistakes(name), waiting(f"designing the observers of {name}"):
@@ -95,13 +95,13 @@ def run(
         if learned:
             simulator = policy_run(str(controller), scenario, observe.value, duration, seed)
             played = simulator.env.batched
-            task, dt, stepper = played.task, played.settings.control_period, simulator.integrator
+            task, dt, stepper = played.task, played.settings.control_period, simulator.observers
             duration = simulator.duration
         else:
             law = _law(scenario, controller)
             controller, task = law.name, None
             stepper = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
-            simulator = scenario.build(law=make_law(law), observe=observe.value, integrator=stepper)
+            simulator = scenario.build(law=make_law(law), observe=observe.value, observers=stepper)
             simulator.reset(seed)
         shown = _film(video, observer, scenario)
         folder = out or Path("runs") / folder_name(scenario.name)
@@ -113,7 +113,7 @@ def run(
         scenario,
         seed=seed,
         dt=dt,
-        integrator=stepper,
+        observers=stepper,
         controller=str(controller),
         observe=observe.value,
     )

@@ -27,7 +27,7 @@ class BatchedEnv:
 
     Arrays are (B, N, ...): copies, then agents; observations and actions (B, N, D) and (B, N, m) where they are
     uniform, otherwise (B, sum of D_i) and (B, sum of m_i), agents side by side. There is no autoreset:
-    `reset(copies=...)` those that ended.
+    `reset(env_ids=...)` those that ended.
 
     Args:
         simulator: B copies, without a law.
@@ -49,7 +49,7 @@ class BatchedEnv:
 
     def __init__(self, simulator: Simulator, task: Task, settings: Settings, scenario: str = "") -> None:
         self.simulator, self.task, self.settings, self.scenario = simulator, task, settings, scenario
-        self.fleet, self.batch = simulator.fleet, simulator.batch
+        self.fleet, self.num_envs = simulator.fleet, simulator.num_envs
         self._members = [i for i in range(len(self.fleet)) if i not in task.leaders]
         self.agents = tuple(self.fleet.ids[i] for i in self._members)
         observed = ObservationColumns(
@@ -68,22 +68,22 @@ class BatchedEnv:
         self._prepare_actions()
         self._prepare_rewards()
         agents = len(self._members)
-        self._routes = LeaderRoutes(self.fleet, task, self.batch) if task.leaders else None
+        self._routes = LeaderRoutes(self.fleet, task, self.num_envs) if task.leaders else None
         rows = simulator.design.states.layout.rows if self._read_observations.uses_delta else 0
-        self._delta = np.zeros((rows, self.batch))
-        self._inputs, self._command, self._physical = (np.zeros((self.fleet.m, self.batch)) for _ in range(3))
-        self._cost = np.zeros((2, agents, self.batch))
-        self._cycles, self._over = np.zeros(self.batch, np.int64), np.ones(self.batch, bool)
-        self._generators: list[np.random.Generator | None] = [None] * self.batch
-        self._seeded = np.zeros(self.batch, bool)
-        self._clipped_actions = np.zeros((self.batch, agents), np.int64)
+        self._delta = np.zeros((rows, self.num_envs))
+        self._inputs, self._command, self._physical = (np.zeros((self.fleet.m, self.num_envs)) for _ in range(3))
+        self._cost = np.zeros((2, agents, self.num_envs))
+        self._cycles, self._over = np.zeros(self.num_envs, np.int64), np.ones(self.num_envs, bool)
+        self._generators: list[np.random.Generator | None] = [None] * self.num_envs
+        self._seeded = np.zeros(self.num_envs, bool)
+        self._clipped_actions = np.zeros((self.num_envs, agents), np.int64)
 
     # -- the episode ---------------------------------------------------------------------------------------------
 
     def reset(
         self,
         seed: int | Sequence[int | None] | None = None,
-        copies: Sequence[int] | IntArray | None = None,
+        env_ids: Sequence[int] | IntArray | None = None,
         initial_states: ArrayLike | None = None,
     ) -> tuple[Float32Array, Infos]:
         """Start a new episode in all copies, or in some.
@@ -91,7 +91,7 @@ class BatchedEnv:
         Args:
             seed: copy b starts from seed + b, or from one seed per copy that is reset. Without a seed a copy goes on
                 drawing from the generator that it was seeded with; one that never was draws fresh entropy.
-            copies: (R,) which; all if left out.
+            env_ids: (R,) indices of the copies to reset; all by default.
             initial_states: (n,) or (R, n) states of all agents, leaders included; what is nan there is drawn.
 
         Returns:
@@ -102,7 +102,7 @@ class BatchedEnv:
                 or infinite; nothing has been reset then.
             DesignError: for initial states that the observers can't start from; likewise.
         """
-        which = self.simulator.chosen(copies)
+        which = self.simulator.env_list(env_ids)
         chosen = seeds(seed, which)
         generators = [self._generator(int(b), one) for b, one in zip(which, chosen, strict=True)]
         if initial_states is not None:
@@ -136,7 +136,8 @@ class BatchedEnv:
         if self._over.any():
             over = np.flatnonzero(self._over)
             raise ValueError(
-                f"no episode is running in {len(over)} of {self.batch} copies, the first {over[0]}: call reset() first"
+                f"no episode is running in {len(over)} of {self.num_envs} copies, the first {over[0]}: call reset() "
+                "first"
             )
         self._take(actions)
         self.simulator.restart_extremes()
@@ -144,7 +145,7 @@ class BatchedEnv:
             self._advance(number)
         self._cycles += 1
         reward, info = self._judge()
-        terminated = np.zeros(self.batch, bool)
+        terminated = np.zeros(self.num_envs, bool)
         if self.settings.success_radius is not None:
             terminated = info[0].max(axis=1) <= self.settings.success_radius
         truncated = (self._cycles >= self.settings.max_cycles) & ~terminated
@@ -167,8 +168,10 @@ class BatchedEnv:
 
     def state(self) -> Float32Array:
         """(B, S) the true global state, `state_fields` by name, in new memory."""
-        simulator, uncounted = self.simulator, np.zeros((self.batch, 1), np.int64)
-        return self._read_state(simulator.x.T, simulator.estimates.T, self._delta, self._inputs, uncounted)
+        simulator, uncounted = self.simulator, np.zeros((self.num_envs, 1), np.int64)
+        return self._read_state(
+            simulator.state.x, simulator.state.memory["estimate"], self._delta, self._inputs, uncounted
+        )
 
     def get_state(self) -> EnvState:
         """A copy of everything that the next steps depend on, generators included."""
@@ -266,18 +269,18 @@ class BatchedEnv:
         """Write actions into the commands, or refuse them and change nothing."""
         given = np.asarray(actions)
         width = int(self.action_offset[-1])
-        shapes: list[tuple[int, ...]] = [(self.batch, width)]
+        shapes: list[tuple[int, ...]] = [(self.num_envs, width)]
         if self.settings.uniform:
-            shapes.insert(0, (self.batch, len(self.agents), width // len(self.agents)))
+            shapes.insert(0, (self.num_envs, len(self.agents), width // len(self.agents)))
         if given.shape not in shapes or given.dtype.kind not in "fiu":
             raise ValueError(f"actions must be numbers of shape {shapes[0]}; got {given.dtype} of shape {given.shape}")
-        flat = np.ascontiguousarray(given.reshape(self.batch, width), np.float64)
+        flat = np.ascontiguousarray(given.reshape(self.num_envs, width), np.float64)
         clipped = np.zeros_like(self._clipped_actions)
         bad = read_actions(flat, self._action_entry, self._action_column, self._action_owner, self._command, clipped)
         if bad >= 0:
             env, entry = divmod(bad, len(self._action_entry))
             owner = self._action_owner[entry]
-            where = f" in copy {env}" if self.batch > 1 else ""
+            where = f" in copy {env}" if self.num_envs > 1 else ""
             raise ValueError(
                 f"the action of {self.agents[owner]!r}{where} isn't finite: entry "
                 f"{self._action_entry[entry] - self.action_offset[owner]} is {flat[env, self._action_entry[entry]]}"
@@ -298,12 +301,12 @@ class BatchedEnv:
     def _judge(self) -> tuple[FloatArray, FloatArray]:
         """Rewards (B, N), and the first three infos (3, B, N)."""
         settings = self.settings
-        simulator, shape = self.simulator, (self.batch, len(self.agents))
+        simulator, shape = self.simulator, (self.num_envs, len(self.agents))
         reward, info = np.empty(shape), np.empty((3, *shape))
         scale = settings.control_period, float(settings.effort)
         seen = simulator.extremes
         ratios = seen.normalized, seen.relative, seen.input_normalized, seen.input_relative
-        judge(*self._edges, simulator.x.T, self._input_owner, self._inputs, scale, ratios, self._cost, reward, info)
+        judge(*self._edges, simulator.state.x, self._input_owner, self._inputs, scale, ratios, self._cost, reward, info)
         if settings.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
         return reward, info
@@ -311,12 +314,14 @@ class BatchedEnv:
     def _observe(self) -> tuple[Float32Array, IntArray]:
         """Observations, and how many entries of each agent's were clipped."""
         simulator = self.simulator
-        clipped = np.zeros((self.batch, len(self.agents)), np.int64)
+        clipped = np.zeros((self.num_envs, len(self.agents)), np.int64)
         if len(self._delta):
             simulator.design.states.delta.evaluate(simulator.t, self._delta)
-        flat = self._read_observations(simulator.x.T, simulator.estimates.T, self._delta, self._inputs, clipped)
+        flat = self._read_observations(
+            simulator.state.x, simulator.state.memory["estimate"], self._delta, self._inputs, clipped
+        )
         if self.settings.uniform:
-            return flat.reshape(self.batch, len(self.agents), -1), clipped
+            return flat.reshape(self.num_envs, len(self.agents), -1), clipped
         return flat, clipped
 
     def _observed(self, info: FloatArray) -> tuple[Float32Array, Infos]:

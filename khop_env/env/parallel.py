@@ -47,8 +47,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
     """
 
     def __init__(self, batched: BatchedEnv, *, name: str, render_mode: str | None = None) -> None:
-        if batched.batch != 1:
-            raise ValueError(f"a ParallelEnv is one copy; got {batched.batch}: use make_vec for several")
+        if batched.num_envs != 1:
+            raise ValueError(f"a ParallelEnv is one copy; got {batched.num_envs}: use make_vec for several")
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(
                 f"render_mode must be None, 'human' or 'rgb_array'; got {render_mode!r}; "

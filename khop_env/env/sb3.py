@@ -39,7 +39,7 @@ class KHopSB3VecEnv(VecEnv):
         self.batched = batched
         self.infos: Infos = {}
         self._actions: NDArray[Any] = np.zeros(0)
-        super().__init__(batched.batch * len(batched.agents), *single_spaces(batched))
+        super().__init__(batched.num_envs * len(batched.agents), *single_spaces(batched))
 
     def reset(self) -> Float32Array:
         """Start new episodes in all copies; from the seed given to `seed`, copy b from seed + b.
@@ -68,7 +68,7 @@ class KHopSB3VecEnv(VecEnv):
         given, shape = np.asarray(self._actions), (self.num_envs, int(batched.action_offset[1]))
         if given.shape != shape:
             raise ValueError(f"actions must have shape {shape}; got {given.shape}")
-        observations, reward, terminated, truncated, infos = batched.step(given.reshape(batched.batch, agents, -1))
+        observations, reward, terminated, truncated, infos = batched.step(given.reshape(batched.num_envs, agents, -1))
         self.infos = infos
         over = terminated | truncated
         described: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -79,7 +79,7 @@ class KHopSB3VecEnv(VecEnv):
                 described[row] = {key: values[row] for key, values in columns.items()}
                 described[row]["terminal_observation"] = last[row]
                 described[row]["TimeLimit.truncated"] = bool(truncated[row // agents])
-            observations, _ = batched.reset(copies=np.flatnonzero(over))
+            observations, _ = batched.reset(env_ids=np.flatnonzero(over))
         rows = observations.reshape(self.num_envs, -1)
         return rows, reward.reshape(-1).astype(np.float32), np.repeat(over, agents), described
 

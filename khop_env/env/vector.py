@@ -43,7 +43,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
         require_uniform(batched, "a vector environment")
         self.metadata = {"name": name, "render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
         self.batched = batched
-        self.num_envs = batched.batch * len(batched.agents)
+        self.num_envs = batched.num_envs * len(batched.agents)
         self.single_observation_space, self.single_action_space = single_spaces(batched)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -73,11 +73,11 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
         given = np.asarray(actions)
         if given.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}; got {given.shape}")
-        observations, reward, terminated, truncated, infos = batched.step(given.reshape(batched.batch, agents, -1))
+        observations, reward, terminated, truncated, infos = batched.step(given.reshape(batched.num_envs, agents, -1))
         over = terminated | truncated
         if over.any():
             last, last_infos = self._rows(observations), infos
-            observations, infos = batched.reset(copies=np.flatnonzero(over))
+            observations, infos = batched.reset(env_ids=np.flatnonzero(over))
             described = self._described(infos)
             described |= self._final(last, last_infos, np.repeat(over, agents))
         else:

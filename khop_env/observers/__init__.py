@@ -1,20 +1,54 @@
-"""THE BELIEF: what each agent believes of agents it can't hear. Everything with rho, xi, eps or a hat is here."""
+"""Observers: pair layout, funnels and the design rule, and every realisation of the paper's PPSO and PPIO.
 
+Everything with rho, xi, eps, a guaranteed bound, or a hat over x or g is here. A realisation owns its memory
+(`Observers`): the coupled proximal step, the explicit step, and the message-passing reference.
+"""
+
+from khop_env.observers.base import (
+    Certified,
+    Extremes,
+    FunnelObservers,
+    Memory,
+    Observers,
+    Plant,
+    PlantState,
+    SolveError,
+)
 from khop_env.observers.design import Bound, DesignError, Funnels, ObserverDesign, TargetObservers
-from khop_env.observers.layout import FloatArray, IntArray, PairLayout
+from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
+from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
+from khop_env.observers.messages import MessagePassing
 from khop_env.observers.performance import Exponential, FunnelBank, PerformanceFunction, lower_bound
+from khop_env.observers.proximal import Proximal
 
 __all__ = [
+    "BatchedRightHandSide",
     "Bound",
+    "Certified",
+    "Derivative",
     "DesignError",
+    "Explicit",
     "Exponential",
+    "Extremes",
     "FloatArray",
     "FunnelBank",
+    "FunnelError",
+    "FunnelObservers",
     "Funnels",
     "IntArray",
+    "Memory",
+    "MessagePassing",
     "ObserverDesign",
+    "Observers",
+    "PairArrays",
     "PairLayout",
     "PerformanceFunction",
+    "Plant",
+    "PlantState",
+    "Proximal",
+    "RightHandSide",
+    "SolveError",
+    "TargetBlock",
     "TargetObservers",
     "lower_bound",
 ]

@@ -19,7 +19,7 @@ import numpy as np
 
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.observers.performance import FunnelBank, PerformanceFunction, scaled
-from khop_env.physics import Fleet, k_hop_neighbors, validate_graph
+from khop_env.physics import Fleet, Links, k_hop_neighbors, validate_graph
 
 Bound = PerformanceFunction | Sequence[PerformanceFunction]
 """A bound on a target's estimation error: one function for all its components, or one for each.
@@ -61,7 +61,7 @@ class Funnels:
     @cached_property
     def gain(self) -> FloatArray:
         """(rows,) lambda_min(M_i) / sqrt(eta_i) of each row's target: what the design rule multiplies delta by."""
-        per_target = self.layout.eigenvalues[:, 0] / np.sqrt(self.layout.plan[:, 0])
+        per_target = self.layout.eigenvalues[:, 0] / np.sqrt(self.layout.arrays.observers)
         return per_target[self.layout.row_target]
 
     @cached_property
@@ -74,11 +74,15 @@ class Funnels:
         """The funnels on the disagreements that the design rule gives, row by row."""
         return FunnelBank([scaled(bound, gain) for bound, gain in zip(self.bounds, self.gain, strict=True)])
 
+    @cached_property
+    def error_bounds(self) -> FunnelBank:
+        """The guaranteed bound on the error of every estimate, in the order of the layout's (P,) vector."""
+        return FunnelBank([self.bounds[row] for row in self.layout.column_row])
+
     def largest_relay(self) -> FloatArray:
         """(rows,) h_max: with one common first guess c the disagreement starts as xi = H (c - x_i)."""
-        plan = self.layout.plan
-        per_target = np.array([self.layout.relay[pair : pair + eta].max() for eta, *_, pair in plan])
-        return per_target[self.layout.row_target] if len(plan) else np.zeros(0)
+        per_target = [self.layout.arrays.relay[block.pairs].max() for block in self.layout.blocks]
+        return np.array(per_target, float)[self.layout.row_target]
 
     def feasible_at_start(self, radius: FloatArray) -> FloatArray:
         """(rows,) largest |xi(0)| over the initial set, as a fraction of rho(0): must be below 1.
@@ -137,6 +141,7 @@ class ObserverDesign:
     theta: PerformanceFunction | Mapping[int, Bound] | None = None
     relay: bool = True
     targets: Sequence[TargetObservers] | None = None
+    links: Links = field(init=False)
     neighborhoods: tuple[tuple[int, ...], ...] = field(init=False)
     options: tuple[TargetObservers, ...] = field(init=False)
     states: Funnels = field(init=False)
@@ -160,7 +165,7 @@ class ObserverDesign:
                     "(Assumption 2-i); give its inputs finite limits or set input_observer=True"
                 )
         neighborhoods = k_hop_neighbors(self.communication, self.k, relay=self.relay)
-        dimensions = [model.n for model in fleet.models]
+        links, dimensions = Links.of(self.communication), [model.n for model in fleet.models]
         observed_inputs = [i for i, option in enumerate(options) if option.input_observer]
         if observed_inputs and self.theta is None:
             raise DesignError(
@@ -168,10 +173,11 @@ class ObserverDesign:
                 f"{fleet.ids[observed_inputs[0]]!r}; give a bound theta or set input_observer=False"
             )
         lay_out = functools.partial(
-            PairLayout.build, self.communication, neighborhoods, dimensions, fleet.state_offset, relay=self.relay
+            PairLayout.build, links, neighborhoods, dimensions, fleet.state_offset, relay=self.relay
         )
         states, inputs = lay_out(), lay_out(targets=observed_inputs)
         values = {
+            "links": links,
             "neighborhoods": neighborhoods,
             "options": tuple(options),
             "states": Funnels(states, self._rows(states, self.delta, "delta")),
@@ -201,15 +207,16 @@ class ObserverDesign:
     ) -> tuple[PerformanceFunction, ...]:
         """One performance function per row of the layout."""
         rows: list[PerformanceFunction] = []
-        for i, (_, n, *_) in zip(layout.target, layout.plan, strict=True):
-            if isinstance(bounds, Mapping) and int(i) not in bounds:
+        for block in layout.blocks:
+            i, n = block.agent, block.components
+            if isinstance(bounds, Mapping) and i not in bounds:
                 raise DesignError(f"{name} has no bound for agent {self.fleet.ids[i]!r}; give one per target")
-            bound = bounds[int(i)] if isinstance(bounds, Mapping) else bounds
+            bound = bounds[i] if isinstance(bounds, Mapping) else bounds
             if isinstance(bound, type):
                 raise DesignError(
                     f"{name}: expected an instance, got the class {bound.__name__}; write {bound.__name__}(...)"
                 )
-            several = list(bound) if isinstance(bound, Sequence) else [bound] * int(n)
+            several = list(bound) if isinstance(bound, Sequence) else [bound] * n
             if len(several) != n or not all(isinstance(one, PerformanceFunction) for one in several):
                 raise DesignError(
                     f"{name} of agent {self.fleet.ids[i]!r}: expected a performance function or a sequence of {n}, one "

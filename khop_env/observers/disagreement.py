@@ -10,7 +10,7 @@ import numpy as np
 
 from khop_env.compiled import compiled, inlined
 from khop_env.elementary import log_ratio
-from khop_env.observers.layout import FloatArray, IntArray
+from khop_env.observers.layout import FloatArray, PairArrays
 
 
 @inlined
@@ -33,53 +33,41 @@ def barrier_curvature(e: float) -> float:
 
 
 @compiled
-def disagreement(
-    plan: IntArray,
-    diagonal: FloatArray,
-    relay: FloatArray,
-    link_start: IntArray,
-    link: IntArray,
-    estimate: FloatArray,
-    source: FloatArray,
-    out: FloatArray,
-) -> None:
+def disagreement(pairs: PairArrays, estimate: FloatArray, source: FloatArray, out: FloatArray) -> None:
     """xi_i = M_i x_tilde_i for every target and component: the neighbour sums that define the disagreement.
 
     Args:
-        plan: and `diagonal`, `relay`, `link_start`, `link`: `PairLayout.arrays`.
-        diagonal: see there.
-        relay: see there.
-        link_start: see there.
-        link: see there.
+        pairs: `PairLayout.arrays`.
         estimate: (P, B) the observers' estimates.
         source: (n, B) the fleet's true vector, of which an observer uses what its neighbours relay.
         out: (P, B) xi, written.
     """
     batch = estimate.shape[1]
-    for t in range(plan.shape[0]):
-        eta, n, offset, origin, pair = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 5]
+    for t in range(pairs.observers.size):
+        eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
+        offset, origin = pairs.column[t], pairs.source[t]
         for a in range(eta):
-            d, h = diagonal[pair + a], relay[pair + a]
+            d, h = pairs.diagonal[pair + a], pairs.relay[pair + a]
             for c in range(n):
                 column = offset + a * n + c
-                if h == 0.0:  # nobody tells it: the state must not even be read
+                if h == 0.0:  # no message carries the state to this observer: it must not even be read
                     for env in range(batch):
                         out[column, env] = d * estimate[column, env]
                 else:
                     for env in range(batch):
                         out[column, env] = d * estimate[column, env] - h * source[origin + c, env]
-                for k in range(link_start[pair + a], link_start[pair + a + 1]):
-                    other = offset + link[k] * n + c
+                for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
+                    other = offset + pairs.entry[k] * n + c
                     for env in range(batch):
                         out[column, env] -= estimate[other, env]
 
 
 @compiled
-def correction(plan: IntArray, xi: FloatArray, rho: FloatArray, e: FloatArray, out: FloatArray) -> None:
+def correction(pairs: PairArrays, xi: FloatArray, rho: FloatArray, e: FloatArray, out: FloatArray) -> None:
     """The observers' correction -rho^-1 J_T(e) eps with e = xi / rho, eps = T(e).
 
     Args:
-        plan: `PairLayout.plan`.
+        pairs: `PairLayout.arrays`.
         xi: (P, B) disagreement.
         rho: (rows, B) funnels.
         e: (P, B) normalised disagreement, written.
@@ -87,8 +75,8 @@ def correction(plan: IntArray, xi: FloatArray, rho: FloatArray, e: FloatArray, o
     """
     batch = xi.shape[1]
     scale = np.empty(batch)
-    for t in range(plan.shape[0]):
-        eta, n, offset, row = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 4]
+    for t in range(pairs.observers.size):
+        eta, n, offset, row = pairs.observers[t], pairs.components[t], pairs.column[t], pairs.row[t]
         for c in range(n):
             for env in range(batch):
                 scale[env] = 1.0 / rho[row + c, env]
@@ -102,10 +90,10 @@ def correction(plan: IntArray, xi: FloatArray, rho: FloatArray, e: FloatArray, o
 
 
 @compiled
-def largest_curvature(plan: IntArray, e: FloatArray, rho: FloatArray, out: FloatArray) -> None:
+def largest_curvature(pairs: PairArrays, e: FloatArray, rho: FloatArray, out: FloatArray) -> None:
     """Write into `out` (targets, B) the largest phi''(e) / rho^2 over each target's observers and components."""
-    for t in range(plan.shape[0]):
-        eta, n, offset, row = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 4]
+    for t in range(pairs.observers.size):
+        eta, n, offset, row = pairs.observers[t], pairs.components[t], pairs.column[t], pairs.row[t]
         for env in range(e.shape[1]):
             largest = 0.0
             for column in range(eta * n):
@@ -115,51 +103,46 @@ def largest_curvature(plan: IntArray, e: FloatArray, rho: FloatArray, out: Float
 
 
 @compiled
-def extremes(
-    plan: IntArray,
-    diagonal: FloatArray,
-    relay: FloatArray,
-    link_start: IntArray,
-    link: IntArray,
+def largest_ratios(
+    pairs: PairArrays,
     estimate: FloatArray,
     source: FloatArray,
     rho: FloatArray,
     gain: FloatArray,
-    out: FloatArray,
+    normalized: FloatArray,
+    relative: FloatArray,
 ) -> None:
-    """Raise `out` (2, B) to the largest |xi| / rho and |x_tilde| / delta over all pairs and components.
+    """Raise running maxima to the largest |xi| / rho and |x_tilde| / delta over all pairs and components.
 
     Args:
-        plan: and `diagonal`, `relay`, `link_start`, `link`: `PairLayout.arrays`.
-        diagonal: see there.
-        relay: see there.
-        link_start: see there.
-        link: see there.
+        pairs: `PairLayout.arrays`.
         estimate: (P, B) estimates.
-        source: (n, B) the truth.
+        source: (n, B) the true values.
         rho: (rows, B) funnels.
         gain: (rows,) the design rule's rho / delta.
-        out: running maxima; inf where a number isn't finite.
+        normalized: (B,) running maxima of |xi| / rho; inf where a number isn't finite.
+        relative: (B,) running maxima of |x_tilde| / delta.
     """
     batch = estimate.shape[1]
     xi = np.empty(batch)
-    for t in range(plan.shape[0]):
-        eta, n, offset, origin, row, pair = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 4], plan[t, 5]
+    for t in range(pairs.observers.size):
+        eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
+        offset, origin, row = pairs.column[t], pairs.source[t], pairs.row[t]
         for a in range(eta):
-            d, h = diagonal[pair + a], relay[pair + a]
+            d, h = pairs.diagonal[pair + a], pairs.relay[pair + a]
             for c in range(n):
                 column = offset + a * n + c
                 for env in range(batch):
                     xi[env] = d * estimate[column, env] - h * source[origin + c, env]
-                for k in range(link_start[pair + a], link_start[pair + a + 1]):
-                    other = offset + link[k] * n + c
+                for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
+                    other = offset + pairs.entry[k] * n + c
                     for env in range(batch):
                         xi[env] -= estimate[other, env]
                 factor = gain[row + c]
                 for env in range(batch):
                     scale = 1.0 / rho[row + c, env]
-                    normalized = abs(xi[env]) * scale
-                    relative = abs(estimate[column, env] - source[origin + c, env]) * scale * factor
-                    normalized = normalized if normalized < np.inf else np.inf  # a NaN must not look fine
-                    out[0, env] = max(out[0, env], normalized)
-                    out[1, env] = max(out[1, env], relative)
+                    ratio = abs(xi[env]) * scale
+                    error = abs(estimate[column, env] - source[origin + c, env]) * scale * factor
+                    ratio = ratio if ratio < np.inf else np.inf  # a NaN must not pass as small
+                    normalized[env] = max(normalized[env], ratio)
+                    relative[env] = max(relative[env], error)

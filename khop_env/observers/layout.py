@@ -9,51 +9,106 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+
+from khop_env.physics import Links
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
 
+class PairArrays(NamedTuple):
+    """A `PairLayout` as compiled loops take it: one array per quantity.
+
+    The first six have an entry per target: how many observers it has (eta_i) and how many components (n_i), and where
+    its part begins of the estimates (P,), of the fleet's vector, of the rows, and of the pairs.
+
+    Attributes:
+        observers: (targets,) eta_i.
+        components: (targets,) n_i.
+        column: (targets,) offset of its estimates in the flat (P,) vector.
+        source: (targets,) offset of its state in the fleet's vector.
+        row: (targets,) its first row.
+        pair: (targets,) its first pair.
+        relay: (pairs,) h_a, the diagonal of H_i: how many neighbours relay the target's true state to the observer, or
+            without the relay assumption 1 for a neighbour of the target and 0 otherwise.
+        diagonal: (pairs,) d_a, the diagonal of M_i.
+        entry_start: (pairs + 1,) where each pair's part of `entry` begins.
+        entry: (entries,) places within the target of the observers whose estimates the observer receives: the
+            off-diagonal -1 entries of M_i.
+        first: (pairs,) place of the first non-zero of each row of M_i (its lower profile).
+    """
+
+    observers: IntArray
+    components: IntArray
+    column: IntArray
+    source: IntArray
+    row: IntArray
+    pair: IntArray
+    relay: FloatArray
+    diagonal: FloatArray
+    entry_start: IntArray
+    entry: IntArray
+    first: IntArray
+
+
+class TargetBlock(NamedTuple):
+    """The observers of one target within a `PairLayout`.
+
+    Attributes:
+        agent: the target.
+        observers: number of its observers, eta_i.
+        components: number of its components, n_i.
+        columns: its part of the flat vector of estimates.
+        sources: its part of the fleet's vector.
+        rows: its rows.
+        pairs: its pairs.
+    """
+
+    agent: int
+    observers: int
+    components: int
+    columns: slice
+    sources: slice
+    rows: slice
+    pairs: slice
+
+
 @dataclass(frozen=True, eq=False)
 class PairLayout:
-    """The pairs (observer, target) of one kind of observer over one communication graph.
+    """The pairs (observer, target) of one kind of observer over one superset of directed links.
 
     A *target* is an agent that is estimated, an *observer* an agent that estimates it, a *row* one component of one
     target (all observers of a row share its funnel), a *pair* one (observer, target).
 
     Attributes:
-        plan: (targets, 6) one line a target: number of observers eta_i, components n_i, offset of its estimates in
-            the flat (P,) vector, of its state in the fleet's, of its first row, and of its first pair.
+        arrays: everything that compiled loops read.
         target: (targets,) the estimated agents, ascending; agents without observers are absent.
         observer: (pairs,) the estimating agents, target by target, in an order that keeps M_i's profile small.
-        relay: (pairs,) h_a, the diagonal of H_i: how many 1-hop neighbours relay the target's true state to the
-            observer, or without the relay assumption 1 for a 1-hop neighbour and 0 otherwise.
-        diagonal: (pairs,) d_a, the diagonal of M_i.
-        link_start: (pairs + 1,) and `link`: for each pair, the places within its target of the observers it exchanges
-            estimates with: the off-diagonal -1 entries of M_i.
-        first: (pairs,) place of the first non-zero of each row of M_i (its lower profile).
+        entry_link: (entries,) for each off-diagonal entry of the matrices the link in `links` that carries it.
+        relay_start: (pairs + 1,) where each pair's part of `relay_link` begins.
+        relay_link: (relays,) the links over which the target's true state reaches each pair's observer.
+        links: who may receive from whom.
         size: P, the length of the flat vector of estimates.
         rows: number of (target, component) rows.
     """
 
-    plan: IntArray
+    arrays: PairArrays
     target: IntArray
     observer: IntArray
-    relay: FloatArray
-    diagonal: FloatArray
-    link_start: IntArray
-    link: IntArray
-    first: IntArray
+    entry_link: IntArray
+    relay_start: IntArray
+    relay_link: IntArray
+    links: Links
     size: int
     rows: int
 
     @staticmethod
     def build(
-        graph: nx.Graph,
+        links: Links,
         neighborhoods: Sequence[Sequence[int]],
         dimensions: Sequence[int],
         offsets: Sequence[int] | IntArray,
@@ -64,52 +119,88 @@ class PairLayout:
         """Lay out the observers of `targets`.
 
         Args:
-            graph: the communication graph, nodes 0..N-1.
+            links: the directed links of the communication graph.
             neighborhoods: per agent its k-hop neighbours (`physics.k_hop_neighbors`).
             dimensions: per agent the number of components estimated, n_i.
             offsets: per agent where its components start in the fleet's flat vector.
-            relay: whether 1-hop neighbours relay the target's state (the paper's Assumption 4).
+            relay: whether neighbours relay the target's state (the paper's Assumption 4).
             targets: agents to observe; all by default.
         """
-        adjacency = [frozenset(graph[node]) - {node} for node in range(graph.number_of_nodes())]
-        plan: list[tuple[int, ...]] = []
+        senders = links.senders
+        blocks: list[tuple[int, ...]] = []
         target: list[int] = []
         observer: list[int] = []
         heard: list[int] = []
         diagonal: list[int] = []
         first: list[int] = []
-        links: list[int] = []
-        link_start = [0]
+        entry: list[int] = []
+        entry_start = [0]
+        entry_link: list[int] = []
+        relay_start = [0]
+        relay_link: list[int] = []
         size = rows = 0
-        for i in range(len(adjacency)) if targets is None else sorted(targets):
-            members = _profile_order(adjacency, neighborhoods[i])
+        for i in range(links.agents) if targets is None else sorted(targets):
+            members = _profile_order(senders, neighborhoods[i])
             if not members:
                 continue
             place = {agent: a for a, agent in enumerate(members)}
-            plan.append((len(members), dimensions[i], size, offsets[i], rows, len(observer)))
+            blocks.append((len(members), dimensions[i], size, offsets[i], rows, len(observer)))
             target.append(i)
             for a, agent in enumerate(members):
-                linked = sorted(place[other] for other in adjacency[agent] if other in place)
-                h = len(adjacency[agent] & adjacency[i]) if relay else int(agent in adjacency[i])
+                linked = sorted(place[other] for other in senders[agent] if other in place)
+                # under Assumption 4 whoever receives from the target passes its state on; otherwise only itself does
+                relays = sorted(p for p in senders[agent] if i in senders[p]) if relay else [i] * (i in senders[agent])
                 observer.append(agent)
-                heard.append(h)
-                diagonal.append(len(linked) + h)
+                heard.append(len(relays))
+                diagonal.append(len(linked) + len(relays))
                 first.append(min(linked[0], a) if linked else a)
-                links.extend(linked)
-                link_start.append(len(links))
+                entry.extend(linked)
+                entry_start.append(len(entry))
+                entry_link.extend(links.index[members[b], agent] for b in linked)
+                relay_link.extend(links.index[p, agent] for p in relays)
+                relay_start.append(len(relay_link))
             size += len(members) * dimensions[i]
             rows += dimensions[i]
+        of_target = np.ascontiguousarray(np.array(blocks, dtype=np.int64).reshape(-1, 6).T)
         return PairLayout(
-            plan=np.array(plan, dtype=np.int64).reshape(-1, 6),
+            PairArrays(
+                observers=of_target[0],
+                components=of_target[1],
+                column=of_target[2],
+                source=of_target[3],
+                row=of_target[4],
+                pair=of_target[5],
+                relay=np.array(heard, dtype=np.float64),
+                diagonal=np.array(diagonal, dtype=np.float64),
+                entry_start=np.array(entry_start, dtype=np.int64),
+                entry=np.array(entry, dtype=np.int64),
+                first=np.array(first, dtype=np.int64),
+            ),
             target=np.array(target, dtype=np.int64),
             observer=np.array(observer, dtype=np.int64),
-            relay=np.array(heard, dtype=np.float64),
-            diagonal=np.array(diagonal, dtype=np.float64),
-            link_start=np.array(link_start, dtype=np.int64),
-            link=np.array(links, dtype=np.int64),
-            first=np.array(first, dtype=np.int64),
+            entry_link=np.array(entry_link, dtype=np.int64),
+            relay_start=np.array(relay_start, dtype=np.int64),
+            relay_link=np.array(relay_link, dtype=np.int64),
+            links=links,
             size=size,
             rows=rows,
+        )
+
+    @cached_property
+    def blocks(self) -> tuple[TargetBlock, ...]:
+        """The targets one after the other, for loops in Python."""
+        first_six = zip(*(values.tolist() for values in self.arrays[:6]), strict=True)
+        return tuple(
+            TargetBlock(
+                agent,
+                eta,
+                n,
+                slice(column, column + eta * n),
+                slice(source, source + n),
+                slice(row, row + n),
+                slice(pair, pair + eta),
+            )
+            for agent, (eta, n, column, source, row, pair) in zip(self.target.tolist(), first_six, strict=True)
         )
 
     @property
@@ -118,67 +209,64 @@ class PairLayout:
         return len(self.observer)
 
     @cached_property
-    def arrays(self) -> tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray]:
-        """What the right-hand sides read: plan, diagonal, relay, link_start, link."""
-        return self.plan, self.diagonal, self.relay, self.link_start, self.link
-
-    @cached_property
     def slot(self) -> dict[tuple[int, int], int]:
         """(observer, target) -> offset of that pair's estimate in the flat vector."""
         return {
-            (int(self.observer[pair + a]), int(agent)): int(offset + a * n)
-            for agent, (eta, n, offset, _, _, pair) in zip(self.target, self.plan, strict=True)
-            for a in range(eta)
+            (observer, block.agent): block.columns.start + a * block.components
+            for block in self.blocks
+            for a, observer in enumerate(self.observer[block.pairs].tolist())
         }
 
     @cached_property
     def column_source(self) -> IntArray:
         """(P,) index into the fleet's flat vector of the true component that each estimate is an estimate of."""
-        columns = [np.tile(source + np.arange(n), eta) for eta, n, _, source, _, _ in self.plan]
-        return np.concatenate(columns) if columns else np.zeros(0, np.int64)
+        return _joined(np.tile(np.arange(b.sources.start, b.sources.stop), b.observers) for b in self.blocks)
 
     @cached_property
     def column_row(self) -> IntArray:
         """(P,) the row, and so the funnel, of each estimate."""
-        columns = [np.tile(row + np.arange(n), eta) for eta, n, _, _, row, _ in self.plan]
-        return np.concatenate(columns) if columns else np.zeros(0, np.int64)
+        return _joined(np.tile(np.arange(b.rows.start, b.rows.stop), b.observers) for b in self.blocks)
 
     @cached_property
     def column_pair(self) -> IntArray:
         """(P,) the pair of each estimate."""
-        columns = [np.repeat(pair + np.arange(eta), n) for eta, n, _, _, _, pair in self.plan]
-        return np.concatenate(columns) if columns else np.zeros(0, np.int64)
+        return _joined(np.repeat(np.arange(b.pairs.start, b.pairs.stop), b.components) for b in self.blocks)
 
     @cached_property
     def row_source(self) -> IntArray:
         """(rows,) index into the fleet's flat vector of each row's true component."""
-        rows = [source + np.arange(n) for _, n, _, source, _, _ in self.plan]
-        return np.concatenate(rows) if rows else np.zeros(0, np.int64)
+        return _joined(np.arange(b.sources.start, b.sources.stop) for b in self.blocks)
 
     @cached_property
     def row_target(self) -> IntArray:
         """(rows,) place in `target` of each row's agent."""
-        return np.repeat(np.arange(len(self.target)), self.plan[:, 1])
+        return np.repeat(np.arange(len(self.target)), self.arrays.components)
 
     def matrix(self, index: int) -> FloatArray:
         """M_i = L_i + H_i of `target[index]` as a dense (eta_i, eta_i) array, ordered as `observer` (Lemma 1: > 0)."""
-        eta, _, _, _, _, pair = self.plan[index]
-        matrix = np.diag(self.diagonal[pair : pair + eta])
-        for a in range(eta):
-            matrix[a, self.link[self.link_start[pair + a] : self.link_start[pair + a + 1]]] = -1.0
+        block, arrays = self.blocks[index], self.arrays
+        matrix = np.diag(arrays.diagonal[block.pairs])
+        for a, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
+            matrix[a, arrays.entry[arrays.entry_start[pair] : arrays.entry_start[pair + 1]]] = -1.0
         return matrix
 
     @cached_property
     def eigenvalues(self) -> FloatArray:
         """(targets, 2): smallest and largest eigenvalue of each M_i."""
         extremes = np.zeros((len(self.target), 2))
-        for eta in np.unique(self.plan[:, 0]):
-            members = np.flatnonzero(self.plan[:, 0] == eta)
+        observers = self.arrays.observers
+        for eta in np.unique(observers):
+            members = np.flatnonzero(observers == eta)
             # eigvalsh takes a stack; a slice at a time keeps ten thousand targets within the memory of a few
             for some in np.array_split(members, max(1, len(members) * int(eta) ** 2 // 1_000_000)):
                 spectrum = np.linalg.eigvalsh(np.stack([self.matrix(index) for index in some]))
                 extremes[some] = spectrum[:, [0, -1]]
         return extremes
+
+
+def _joined(parts: Iterable[IntArray]) -> IntArray:
+    """The parts after each other; an empty array of none."""
+    return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
 def _profile_order(adjacency: Sequence[frozenset[int]], members: Sequence[int]) -> list[int]:

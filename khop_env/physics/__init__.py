@@ -16,6 +16,7 @@ from khop_env.physics.graph import (
     random_geometric_graph,
     validate_graph,
 )
+from khop_env.physics.links import Links
 from khop_env.physics.models import (
     MODELS,
     DoubleIntegrator,
@@ -44,6 +45,7 @@ __all__ = [
     "Group",
     "Gust",
     "IndexArray",
+    "Links",
     "SingleIntegrator",
     "Sinusoid",
     "Sum",

@@ -179,7 +179,8 @@ def _steady_state_bound(scenario: Scenario) -> Assumption:
     states = scenario.design.states
     if not states.layout.size:
         return Assumption("6", statement, "holds by construction", "nobody is estimated")
-    rows = states.layout.plan[states.layout.row_target, 0].astype(float)  # how many observers share each row's delta
+    # how many observers share each row's delta
+    rows = states.layout.arrays.observers[states.layout.row_target].astype(float)
     floor = float(np.sqrt(rows @ states.delta.infimum() ** 2))
     own = sorted({type(one).__name__ for one in states.bounds if not isinstance(one, Exponential)})
     time = None if own else _first_time_below(lambda t: _norm(states, rows, t), _MARGIN * floor)

@@ -75,7 +75,7 @@ def _default_agent(recording: Recording, scenario: Scenario) -> int:
     if scenario.name == "paper" and len(recording.fleet) > 3:
         return 3
     layout = recording.design.states.layout
-    return int(layout.target[np.argmax(layout.plan[:, 0])]) if len(layout.plan) else 0
+    return int(layout.target[np.argmax(layout.arrays.observers)]) if len(layout.target) else 0
 
 
 def _headline(recording: Recording, scenario: Scenario) -> str:
@@ -153,13 +153,12 @@ def _label_starts(axes: Axes, starts: FloatArray, labels: list[str]) -> None:
 def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agent: int, title: str) -> None:
     axes.set_title(title, loc="left")
     layout = kind.funnels.layout
-    line = np.flatnonzero(layout.target == agent)
-    if not line.size:
+    block = next((block for block in layout.blocks if block.agent == agent), None)
+    if block is None:
         _explain_absence(axes, recording, agent)
         return
-    eta, n, offset, _, first, _ = layout.plan[line[0]].tolist()
-    columns, rows = slice(offset, offset + eta * n), slice(first, first + n)
-    shape = len(kind.time), eta, n
+    columns, rows = block.columns, block.rows
+    shape = len(kind.time), block.observers, block.components
     truth = kind.truth[:, layout.column_source[columns]]
     error = np.abs(kind.estimate[:, columns] - truth).reshape(shape).max(axis=1)
     disagreement = np.abs(kind.disagreement[:, columns]).reshape(shape).max(axis=1)

@@ -10,11 +10,11 @@ import numpy as np
 
 import khop_env
 from khop_env.env import Task
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, Observers
 from khop_env.physics import Fleet
 from khop_env.results.recording import Recording
 from khop_env.scenarios import Scenario
-from khop_env.simulation import Integrator, Observe
+from khop_env.simulation import Observe
 
 _ABSURD = 1e6  # times the largest initial state: no task sends agents so far away
 
@@ -66,7 +66,7 @@ def summarize(
     *,
     seed: int,
     dt: float,
-    integrator: Integrator,
+    observers: Observers,
     controller: str,
     observe: Observe,
 ) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def summarize(
         scenario: what was run.
         seed: of the initial state and the disturbance.
         dt: step in s.
-        integrator: how it was integrated.
+        observers: how they were stepped.
         controller: name of the feedback law.
         observe: what the law saw of agents out of earshot.
     """
@@ -97,8 +97,8 @@ def summarize(
         "observe": observe,
         "seed": seed,
         "dt": dt,
-        "integrator": integrator.name,
-        "order": integrator.order,
+        "integrator": observers.name,
+        "order": observers.order,
         "duration": float(recording.time[-1]),
         "steps": recording.steps,
         "samples": len(recording.time),

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from khop_env.observers import FloatArray, FunnelBank, Funnels, ObserverDesign
+from khop_env.observers import Extremes, FloatArray, FunnelBank, FunnelError, Funnels, ObserverDesign, SolveError
 from khop_env.physics import Fleet
-from khop_env.simulation import Extremes, FunnelError, Simulator, SolveError
+from khop_env.simulation import Simulator
 
 Progress = Callable[[float], None]
 """Called now and then with the fraction of the episode that is done."""
@@ -19,7 +19,6 @@ Progress = Callable[[float], None]
 MOST_ROWS = 5_000_000
 """Samples times estimates that a recording may hold (40 MB an array): larger fleets are sampled less often."""
 
-_WARM_UP_STEP = 1e-9  # s: short enough for any integrator, long enough to run all of its code
 _TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.07000000000000001
 
 
@@ -135,8 +134,8 @@ def record(
     Raises:
         ValueError: for more than one environment, or a duration or step that isn't positive and finite.
     """
-    if simulator.batch != 1:
-        raise ValueError(f"one environment is recorded at a time; the simulator has batch={simulator.batch}")
+    if simulator.num_envs != 1:
+        raise ValueError(f"one environment is recorded at a time; the simulator has num_envs={simulator.num_envs}")
     for name, value in (("duration", duration), ("dt", dt), ("samples_per_second", samples_per_second)):
         if not (value > 0.0 and math.isfinite(value)):
             raise ValueError(f"{name} must be positive and finite; got {value!r}")
@@ -148,7 +147,7 @@ def record(
     samples = _Samples(simulator, 1 + math.ceil(steps / stride))
     error: FunnelError | SolveError | None = None
     with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError does, and a summary says what ran away
-        _warm_up(simulator)
+        simulator.warm_up()
         start = shown = clock.perf_counter()
         samples.take()
         done = 0
@@ -210,14 +209,3 @@ class _Samples:
             wall_time=wall_time,
             error=error,
         )
-
-
-def _warm_up(simulator: Simulator) -> None:
-    """Compile everything that a step runs, so that the wall time tells of stepping only; the state is put back."""
-    saved = simulator.save()
-    try:
-        simulator.step(_WARM_UP_STEP)
-    except (FunnelError, SolveError):
-        pass  # the first real step will say so again
-    finally:
-        simulator.restore(saved)

@@ -102,7 +102,8 @@ def _funnel_groups(
     layout = funnels.layout
     described: dict[tuple[Hashable, float], dict[str, Any]] = {}
     targets: dict[int, list[dict[str, Any]]] = {}
-    for i, (_, n, _, _, first, _) in zip(layout.target.tolist(), layout.plan.tolist(), strict=True):
+    for block in layout.blocks:
+        i, n, first = block.agent, block.components, block.rows.start
         groups: dict[Hashable, dict[str, Any]] = {}
         for row, component in zip(range(first, first + n), design.fleet.models[i].states, strict=True):
             bound = funnels.bounds[row]

@@ -12,9 +12,18 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.observers import Bound, DesignError, Exponential, ObserverDesign, PerformanceFunction, TargetObservers
+from khop_env.observers import (
+    Bound,
+    DesignError,
+    Exponential,
+    ObserverDesign,
+    Observers,
+    PerformanceFunction,
+    Proximal,
+    TargetObservers,
+)
 from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
-from khop_env.simulation import InitialSet, Integrator, Law, Observe, Proximal, Simulator
+from khop_env.simulation import InitialSet, Law, Observe, Simulator
 
 Bounds = PerformanceFunction | Mapping[str, Bound]
 """Bounds on estimation errors: one function for all agents, or one `Bound` per agent type."""
@@ -48,8 +57,8 @@ class Scenario:
         radius: (n,) its half widths.
         law: the feedback law it is meant to run with.
         duration: length of an experiment in s.
-        dt: step of the proximal integrator in s.
-        order: its order.
+        dt: step in s.
+        order: of the proximal step.
 
     Raises:
         ValueError: if graphs, sets and agents don't fit together; the message says which.
@@ -178,16 +187,16 @@ class Scenario:
         *,
         law: Law | None = None,
         observe: Observe = "estimate",
-        integrator: Integrator | None = None,
-        batch: int = 1,
+        observers: Observers | None = None,
+        num_envs: int = 1,
     ) -> Simulator:
-        """A simulator of `batch` copies.
+        """A simulator of `num_envs` environments.
 
         Args:
             law: feedback law, e.g. `agents.make_law(scenario.law)`; None to give inputs to `Simulator.step`.
             observe: what the law sees of agents out of earshot.
-            integrator: the proximal one of `order` by default.
-            batch: number of copies B.
+            observers: how they are stepped; `Proximal` of the scenario's `order` by default.
+            num_envs: number of environments B.
         """
         return Simulator(
             self.design,
@@ -196,8 +205,8 @@ class Scenario:
             law=law,
             task=self.task,
             observe=observe,
-            integrator=integrator or Proximal(self.order),
-            batch=batch,
+            observers=observers or Proximal(self.order),
+            num_envs=num_envs,
         )
 
     def _per_agent(self, bounds: Bounds, name: str) -> PerformanceFunction | dict[int, Bound]:

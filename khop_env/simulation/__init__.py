@@ -1,27 +1,19 @@
-"""THE CLOCK: world and belief advance together. Everything with dt in it is here."""
+"""Plant and observers advance together: the plant's stepper, the simulator, its state, and what a law sees."""
 
-from khop_env.simulation.explicit import BatchedRightHandSide, Explicit, FunnelError, RightHandSide
-from khop_env.simulation.integrators import Integrator, Proximal, SolveError
-from khop_env.simulation.messages import MessagePassing
-from khop_env.simulation.simulator import Extremes, InitialSet, Simulator
-from khop_env.simulation.state import SimulatorState
-from khop_env.simulation.view import OBSERVE, Law, Observe, View
+from khop_env.simulation.plant import FleetPlant
+from khop_env.simulation.simulator import InitialSet, Simulator
+from khop_env.simulation.state import LinkState, SimulatorState
+from khop_env.simulation.view import OBSERVE, Law, Observe, View, ViewBuilder
 
 __all__ = [
     "OBSERVE",
-    "BatchedRightHandSide",
-    "Explicit",
-    "Extremes",
-    "FunnelError",
+    "FleetPlant",
     "InitialSet",
-    "Integrator",
     "Law",
-    "MessagePassing",
+    "LinkState",
     "Observe",
-    "Proximal",
-    "RightHandSide",
     "Simulator",
     "SimulatorState",
-    "SolveError",
     "View",
+    "ViewBuilder",
 ]

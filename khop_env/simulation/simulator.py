@@ -12,12 +12,24 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.observers import FloatArray, Funnels, IntArray, ObserverDesign
-from khop_env.observers.disagreement import disagreement, extremes
-from khop_env.simulation.closed_loop import ClosedLoop
-from khop_env.simulation.integrators import Integrator, Proximal
-from khop_env.simulation.state import SimulatorState
-from khop_env.simulation.view import Law, Observe
+from khop_env.observers import (
+    Certified,
+    Extremes,
+    FloatArray,
+    FunnelError,
+    Funnels,
+    IntArray,
+    ObserverDesign,
+    Observers,
+    Proximal,
+    SolveError,
+)
+from khop_env.observers.disagreement import disagreement
+from khop_env.simulation.plant import FleetPlant
+from khop_env.simulation.state import LinkState, SimulatorState
+from khop_env.simulation.view import Law, Observe, ViewBuilder
+
+_WARM_UP_STEP = 1e-9  # s: short enough for any observers, long enough to run all of their code
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,23 +49,6 @@ class InitialSet:
         return self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
 
 
-@dataclass(frozen=True)
-class Extremes:
-    """The largest ratios since reset or `restart_extremes`, one per environment: below 1 the guarantee holds.
-
-    Attributes:
-        normalized: (B,) largest |xi| / rho over pairs, components and steps.
-        relative: (B,) largest |x_tilde| / delta.
-        input_normalized: (B,) largest |mu| / omega.
-        input_relative: (B,) largest |g_tilde| / theta.
-    """
-
-    normalized: FloatArray
-    relative: FloatArray
-    input_normalized: FloatArray
-    input_relative: FloatArray
-
-
 class Simulator:
     """B copies of a fleet, its disturbances and its observers, advanced together.
 
@@ -65,8 +60,12 @@ class Simulator:
             `step` (sampled control).
         task: task graph; needed with a law.
         observe: what the law sees of agents out of earshot: "estimate", "oracle" or "local".
-        integrator: `Proximal(order=2)` by default.
-        batch: number of environments B.
+        observers: how they are stepped; `Proximal(order=2)` by default.
+        num_envs: number of environments B.
+
+    Attributes:
+        state: everything that a step reads and writes, batch last.
+        observers: this simulator's own copy.
 
     Raises:
         DesignError: if the initial set doesn't fit into the funnels.
@@ -82,25 +81,32 @@ class Simulator:
         law: Law | None = None,
         task: nx.Graph | None = None,
         observe: Observe = "estimate",
-        integrator: Integrator | None = None,
-        batch: int = 1,
+        observers: Observers | None = None,
+        num_envs: int = 1,
     ) -> None:
         if law is not None and task is None:
             raise ValueError("a law acts along the edges of a task graph; give task=")
-        if batch < 1:
-            raise ValueError(f"batch must be at least 1; got {batch!r}")
-        self.design, self.fleet, self.initial, self.batch = design, design.fleet, initial, batch
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1; got {num_envs!r}")
+        self.design, self.fleet, self.initial, self.num_envs = design, design.fleet, initial, num_envs
         bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` sees where it starts
         design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
-        self.integrator: Integrator = copy.copy(integrator or Proximal())  # its buffers are this simulator's own
+        self.observers: Observers = copy.copy(observers or Proximal())  # its buffers are this simulator's own
+        self.observers.prepare(design, num_envs)
         attached = None if disturbance is None else disturbance.attach(self.fleet)
-        self._loop = ClosedLoop(design, attached, law, task, observe, batch)
-        draws = 0 if attached is None else attached.draws
-        sizes = design.states.layout.size, design.inputs.layout.size
-        self._state = SimulatorState.zeros(batch, self.fleet.n, self.fleet.m, *sizes, draws)
-        self.integrator.prepare(self._loop)
-        self._extremes = np.zeros((4, batch))
-        self._rho = [np.ones((funnels.layout.rows, batch)) for funnels in (design.states, design.inputs)]
+        views = None if task is None else ViewBuilder(design, task, observe, num_envs)
+        self.plant = FleetPlant(self.fleet, num_envs, attached, law, views)
+        self.state = SimulatorState(
+            t=np.zeros(num_envs),
+            x=np.zeros((self.fleet.n, num_envs)),
+            u=np.zeros((self.fleet.m, num_envs)),
+            g=np.zeros((self.fleet.n, num_envs)),
+            drawn=np.zeros((num_envs, 0 if attached is None else attached.draws)),
+            memory=self.observers.allocate(),
+            links=LinkState.ideal(design.links, num_envs),
+        )
+        self._before = self.state.copy()
+        self._extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         self.reset(seed=0)
 
     # -- reading -------------------------------------------------------------------------------------------------
@@ -108,37 +114,41 @@ class Simulator:
     @property
     def t(self) -> FloatArray:
         """(B,) time since reset in s."""
-        return self._state.t
+        return self.state.t
 
     @property
     def x(self) -> FloatArray:
         """(B, n) true states; `fleet.state_slice(i)` is agent i's part."""
-        return self._state.x.T
+        return self.state.x.T
 
     @property
     def u(self) -> FloatArray:
         """(B, m) inputs in force."""
-        return self._state.u.T
+        return self.state.u.T
 
     @property
     def g(self) -> FloatArray:
         """(B, n) their effect g_i(x_i, u_i) on the states."""
-        return self._state.g.T
+        return self.state.g.T
 
     @property
     def estimates(self) -> FloatArray:
         """(B, P) state estimates in the order of `design.states.layout`."""
-        return self._state.estimate.T
+        return self.state.memory["estimate"].T
 
     @property
     def input_estimates(self) -> FloatArray:
         """(B, Q) estimates of g in the order of `design.inputs.layout`."""
-        return self._state.input_estimate.T
+        return self.state.memory["input_estimate"].T
 
     @property
     def extremes(self) -> Extremes:
         """The largest ratios at any grid point since the last reset."""
-        return Extremes(*self._extremes.copy())
+        return self._extremes.copied()
+
+    def error_bounds(self) -> Certified:
+        """The guaranteed bound on the error of every estimate now, (P, B), batch last, and what it rests on."""
+        return self.observers.bound(self.state, np.empty_like(self.state.memory["estimate"]))
 
     def errors(self) -> FloatArray:
         """(B, P) estimation errors x_tilde."""
@@ -146,7 +156,7 @@ class Simulator:
 
     def disagreements(self) -> FloatArray:
         """(B, P) disagreements xi."""
-        return self._disagreement(self.design.states, self._state.estimate, self._state.x).T
+        return self._disagreement(self.design.states, "estimate", self.state.x)
 
     def input_errors(self) -> FloatArray:
         """(B, Q) estimation errors of g."""
@@ -154,7 +164,7 @@ class Simulator:
 
     def input_disagreements(self) -> FloatArray:
         """(B, Q) input disagreements mu."""
-        return self._disagreement(self.design.inputs, self._state.input_estimate, self._state.g).T
+        return self._disagreement(self.design.inputs, "input_estimate", self.state.g)
 
     # -- writing -------------------------------------------------------------------------------------------------
 
@@ -162,7 +172,7 @@ class Simulator:
         self,
         seed: int | Sequence[int | np.random.Generator] = 0,
         x0: ArrayLike | None = None,
-        environments: Sequence[int] | IntArray | None = None,
+        env_ids: Sequence[int] | IntArray | None = None,
     ) -> Simulator:
         """Start a new episode, in every environment or in some; the others keep every bit.
 
@@ -170,32 +180,32 @@ class Simulator:
             seed: environment b draws its initial state and disturbance from seed + b; or one seed for each environment
                 that is reset, in their order.
             x0: (n,) or (R, n) initial states instead of drawn ones, for the R environments that are reset.
-            environments: (R,) which; all B if left out.
+            env_ids: (R,) their indices; all B by default.
 
         Raises:
-            ValueError: for x0 of a wrong shape or not finite, not R seeds, or `environments` that aren't
-                different ones.
+            ValueError: for x0 of a wrong shape or not finite, not R seeds, or `env_ids` that are out of range,
+                duplicated or not integers.
             DesignError: for an x0 that the observers can't start from; nothing has been reset then.
         """
-        which = self.chosen(environments)
-        seeds = [seed + int(b) for b in which] if isinstance(seed, int | np.integer) else list(seed)
-        if len(seeds) != len(which):
-            raise ValueError(f"expected one seed or {len(which)}, one per environment; got {len(seeds)}")
-        generators = [np.random.default_rng(one) for one in seeds]  # a seed that is none is refused here
-        given = self._initial_states(x0, len(which))
-        state, loop = self._state, self._loop
-        for b, rng in zip(which, generators, strict=True):
+        chosen = self.env_list(env_ids)
+        seeds = [seed + int(b) for b in chosen] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != len(chosen):
+            raise ValueError(f"expected one seed or {len(chosen)}, one per environment; got {len(seeds)}")
+        generators = [np.random.default_rng(each) for each in seeds]  # raises for what can't be a seed
+        start = self._initial_states(x0, len(chosen))
+        state, disturbance = self.state, self.plant.disturbance
+        for b, rng in zip(chosen, generators, strict=True):
             state.x[:, b] = self.initial.draw(rng)
-            if loop.disturbance is not None:
-                state.drawn[b] = loop.disturbance.draw(rng)
-        if given is not None:
-            state.x[:, which] = np.broadcast_to(given, (len(which), self.fleet.n)).T
-        state.estimate[:, which] = self.initial.center[self.design.states.layout.column_source][:, None]
-        for zeros in (state.t, state.u, state.input_estimate, state.eps, state.nu, self._extremes):
-            zeros[..., which] = 0.0
-        self.integrator.start(state)
-        self._watch()
-        if not np.all(self._extremes[2, which] < 1.0):
+            if disturbance is not None:
+                state.drawn[b] = disturbance.draw(rng)
+        if start is not None:
+            state.x[:, chosen] = np.broadcast_to(start, (len(chosen), self.fleet.n)).T
+        for zeros in (state.t, state.u, *self._extremes):
+            zeros[..., chosen] = 0.0
+        self.observers.reset(state.memory, chosen, generators, self.initial.center)
+        self.plant.actuate(state)
+        self.observers.raise_extremes(state, self._extremes)
+        if not np.all(self._extremes.input_normalized[chosen] < 1.0):
             away = np.where(np.isfinite(self.g), np.abs(self.g), 0.0).max(axis=0)
             self.design.require_feasible_start(np.zeros(self.fleet.n), away)
         return self
@@ -206,93 +216,116 @@ class Simulator:
         Args:
             dt: step in s, positive.
             u: (m,) or (B, m) inputs held over the step, where the simulator has no law; the last ones if left out.
-                They are used as given: whoever needs the input limits, as a bounded g does, keeps them.
+                They are not clipped: keep them within `input_limit` if the design assumes a bounded input map.
 
         Raises:
             ValueError: for a step that isn't positive, or inputs given to a simulator with a law, misshapen or not
                 finite; the state is unchanged.
             FunnelError: if an explicit step leaves the funnel; the state is the last one inside.
-            SolveError: if a right-hand side gives numbers that aren't finite.
+            SolveError: if a right-hand side gives numbers that aren't finite; likewise.
         """
         if not 0.0 < dt < math.inf:
             raise ValueError(f"dt must be positive and finite; got {dt!r}")
         if u is not None:
-            self._hold(u)
-        self.integrator.step(self._state, float(dt))
-        self._watch()
+            self.state.u.T[...] = self._checked_inputs(u)
+            self.plant.actuate(self.state)
+        self.advance(float(dt))
+
+    def hold(self, u: FloatArray) -> None:
+        """Hold inputs (m, B) from now on; batch last, and not checked: for callers that have done so.
+
+        Args:
+            u: batch last, finite, in a simulator without a law.
+        """
+        self.state.u[...] = u
+        self.plant.actuate(self.state)
+
+    def advance(self, dt: float) -> None:
+        """`step` with the inputs in force, and without checking `dt`: for callers that have done so."""
+        state, before = self.state, self._before
+        state.copy_step(before)
+        try:
+            self.observers.advance(self.plant, before, state, dt)
+        except BaseException:
+            before.copy_step(state)
+            raise
+        self.observers.raise_extremes(state, self._extremes)
+
+    def warm_up(self) -> None:
+        """Compile everything that a step runs; the state stays as it is."""
+        saved, seen = self.save(), self._extremes.copied()
+        try:
+            self.advance(_WARM_UP_STEP)
+        except (FunnelError, SolveError):
+            pass  # the first real step will raise it again
+        finally:
+            self.restore(saved)
+            self._extremes = seen
 
     def save(self) -> SimulatorState:
         """Everything needed to continue bit for bit."""
-        return self._state.copy()
+        return self.state.copy()
 
     def restore(self, saved: SimulatorState) -> None:
         """Continue from a saved state; `extremes` start anew.
 
         Raises:
-            ValueError: if it was saved by a simulator of other dimensions.
+            ValueError: if it was saved by a simulator of other dimensions or other observers.
         """
-        self._state.assign(saved)
-        self._extremes[...] = 0.0
-        self._watch()
+        self.state.assign(saved)
+        self.restart_extremes()
+        self.observers.raise_extremes(self.state, self._extremes)
 
     def restart_extremes(self) -> None:
         """Forget the ratios seen so far: `extremes` are those of the steps to come."""
-        self._extremes[...] = 0.0
+        for running in self._extremes:
+            running[...] = 0.0
 
-    def chosen(self, environments: Sequence[int] | IntArray | None) -> IntArray:
-        """The environments meant, by number; all if None.
+    def env_list(self, env_ids: Sequence[int] | IntArray | None) -> IntArray:
+        """Indices of environments, checked; all of them for None.
 
         Raises:
-            ValueError: for one that there isn't, one named twice, or anything else than whole numbers.
+            ValueError: if an index is out of range, duplicated, or not an integer.
         """
-        if environments is None:
-            return np.arange(self.batch)
-        which = np.asarray(environments)
-        if which.dtype == bool:
-            raise ValueError("environments must be numbers, not a mask: give np.flatnonzero(mask)")
-        wrong = which.ndim != 1 or (which.size and which.dtype.kind not in "iu")
-        if wrong or np.any((which < 0) | (which >= self.batch)) or len(np.unique(which)) < len(which):
-            raise ValueError(f"environments must be different ones among 0 to {self.batch - 1}; got {environments!r}")
-        return which.astype(np.int64)
+        if env_ids is None:
+            return np.arange(self.num_envs)
+        chosen = np.asarray(env_ids)
+        if chosen.dtype == bool:
+            raise ValueError("env_ids must be numbers, not a mask: give np.flatnonzero(mask)")
+        wrong = chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu")
+        if wrong or np.any((chosen < 0) | (chosen >= self.num_envs)) or len(np.unique(chosen)) < len(chosen):
+            raise ValueError(f"env_ids must be different ones among 0 to {self.num_envs - 1}; got {env_ids!r}")
+        return chosen.astype(np.int64)
 
     def _initial_states(self, x0: ArrayLike | None, count: int) -> FloatArray | None:
         """Check given initial states, before anything is overwritten."""
         if x0 is None:
             return None
-        given = np.asarray(x0, dtype=float)
-        if given.shape not in ((self.fleet.n,), (count, self.fleet.n)) or not np.all(np.isfinite(given)):
+        states = np.asarray(x0, dtype=float)
+        if states.shape not in ((self.fleet.n,), (count, self.fleet.n)) or not np.all(np.isfinite(states)):
             raise ValueError(
-                f"x0 must be finite, of shape ({self.fleet.n},) or ({count}, {self.fleet.n}); got shape {given.shape}"
+                f"x0 must be finite, of shape ({self.fleet.n},) or ({count}, {self.fleet.n}); got shape {states.shape}"
             )
-        away = np.abs(given - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
+        away = np.abs(states - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
         self.design.require_feasible_start(away, np.zeros(self.fleet.n))
-        return given
+        return states
 
-    def _hold(self, u: ArrayLike) -> None:
-        if self._loop.law is not None:
+    def _checked_inputs(self, u: ArrayLike) -> FloatArray:
+        """Inputs given to `step`, or an error that names what is wrong with them."""
+        if self.plant.law is not None:
             raise ValueError("this simulator has a law, which computes the inputs; build it with law=None to give u")
-        given = np.asarray(u, dtype=float)
-        if given.shape not in ((self.fleet.m,), (self.batch, self.fleet.m)):
-            raise ValueError(f"u must have shape ({self.fleet.m},) or {(self.batch, self.fleet.m)}; got {given.shape}")
-        if not np.isfinite(given).all():
-            bad = np.flatnonzero(~np.isfinite(given.reshape(-1, self.fleet.m)).all(axis=0))
+        inputs = np.asarray(u, dtype=float)
+        if inputs.shape not in ((self.fleet.m,), (self.num_envs, self.fleet.m)):
+            raise ValueError(
+                f"u must have shape ({self.fleet.m},) or {(self.num_envs, self.fleet.m)}; got {inputs.shape}"
+            )
+        if not np.isfinite(inputs).all():
+            bad = np.flatnonzero(~np.isfinite(inputs.reshape(-1, self.fleet.m)).all(axis=0))
             agent, name, unit = self.fleet.input_names()[bad[0]]
             raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
-        self._state.u.T[...] = given
-        self.integrator.start(self._state)
+        return inputs
 
-    def _disagreement(self, funnels: Funnels, estimate: FloatArray, source: FloatArray) -> FloatArray:
-        out = np.zeros((funnels.layout.size, self.batch))
-        disagreement(*funnels.layout.arrays, estimate, source, out)
-        return out
-
-    def _watch(self) -> None:
-        """Raise the running extremes to those of the present state."""
-        state = self._state
-        for funnels, estimate, source, rho, running in (
-            (self.design.states, state.estimate, state.x, self._rho[0], self._extremes[:2]),
-            (self.design.inputs, state.input_estimate, state.g, self._rho[1], self._extremes[2:]),
-        ):
-            if funnels.layout.size:
-                funnels.rho.evaluate(state.t, rho)
-                extremes(*funnels.layout.arrays, estimate, source, rho, funnels.gain, running)
+    def _disagreement(self, funnels: Funnels, memory: str, source: FloatArray) -> FloatArray:
+        out = np.zeros((funnels.layout.size, self.num_envs))
+        disagreement(funnels.layout.arrays, self.state.memory[memory], source, out)
+        return out.T

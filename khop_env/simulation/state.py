@@ -1,77 +1,90 @@
-"""The simulator's whole state: what has to be saved so that a run continues bit for bit."""
+"""A simulator's whole state: what has to be saved so that a run continues bit for bit."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, Memory
+from khop_env.physics import Links
+
+
+@dataclass(frozen=True, eq=False)
+class LinkState:
+    """Which links are up, and how old is what came over them, in B environments.
+
+    Attributes:
+        weight: (L, B) 1 while a link is up, 0 while it is down, in the order of `ObserverDesign.links`.
+        age: (L, B) of the newest message that was delivered, in s.
+    """
+
+    weight: FloatArray
+    age: FloatArray
+
+    @staticmethod
+    def ideal(links: Links, num_envs: int) -> LinkState:
+        """All links up, and everything delivered at once: read-only views of one number each, which cost nothing."""
+        shape = len(links), num_envs
+        return LinkState(np.broadcast_to(1.0, shape), np.broadcast_to(0.0, shape))
 
 
 @dataclass(slots=True)
 class SimulatorState:
-    """Arrays of B environments, batch last; everything an integrator reads and writes.
+    """Arrays of B environments, batch last; everything that a step reads and writes.
 
     Attributes:
         t: (B,) time since reset in s.
         x: (n, B) true states.
         u: (m, B) inputs in force.
         g: (n, B) their effect g_i(x_i, u_i).
-        estimate: (P, B) state estimates.
-        eps: (P, B) transformed disagreement of the proximal step: where the next solve starts.
-        input_estimate: (Q, B) estimates of g.
-        nu: (Q, B) transformed input disagreement, likewise.
         drawn: (B, K) the disturbance's random numbers of this episode.
+        memory: of the observers, by name.
+        links: which links are up.
     """
 
     t: FloatArray
     x: FloatArray
     u: FloatArray
     g: FloatArray
-    estimate: FloatArray
-    eps: FloatArray
-    input_estimate: FloatArray
-    nu: FloatArray
     drawn: FloatArray
+    memory: Memory
+    links: LinkState
 
-    @staticmethod
-    def zeros(batch: int, n: int, m: int, pairs: int, input_pairs: int, draws: int) -> SimulatorState:
-        """A state of zeros.
-
-        Args:
-            batch: number of environments B.
-            n: states of the fleet.
-            m: inputs of the fleet.
-            pairs: P, the length of the state estimates.
-            input_pairs: Q, the length of the input estimates.
-            draws: K, the disturbance's random numbers.
-        """
-        t, drawn = np.zeros(batch), np.zeros((batch, draws))
-        x, u, g, y, eps, ghat, nu = (np.zeros((k, batch)) for k in (n, m, n, pairs, pairs, input_pairs, input_pairs))
-        return SimulatorState(t, x, u, g, y, eps, ghat, nu, drawn)
+    def arrays(self) -> dict[str, FloatArray]:
+        """Every array that changes, by name; the observers' memory included."""
+        return {"t": self.t, "x": self.x, "u": self.u, "g": self.g, "drawn": self.drawn, **self.memory}
 
     def copy(self) -> SimulatorState:
         """An independent copy."""
-        return SimulatorState(*(getattr(self, f.name).copy() for f in fields(self)))
+        memory = {name: values.copy() for name, values in self.memory.items()}
+        t, x, u, g, drawn = (array.copy() for array in (self.t, self.x, self.u, self.g, self.drawn))
+        return SimulatorState(t, x, u, g, drawn, memory, self.links)
 
-    def copy_dynamic(self, other: SimulatorState) -> None:
-        """Write all but the episode's draws into `other`, of the same shapes; quicker than `assign`."""
-        for name in ("t", "x", "u", "g", "estimate", "eps", "input_estimate", "nu"):
-            np.copyto(getattr(other, name), getattr(self, name))
+    def copy_step(self, other: SimulatorState) -> None:
+        """Write what a step changes into `other`, of the same shapes: all but the episode's draws."""
+        for ours, theirs in ((self.t, other.t), (self.x, other.x), (self.u, other.u), (self.g, other.g)):
+            np.copyto(theirs, ours)
+        for name, ours in self.memory.items():
+            np.copyto(other.memory[name], ours)
 
     def assign(self, other: SimulatorState) -> None:
-        """Overwrite this state in place.
+        """Overwrite this state in place; memory of `other` that these observers don't have is left out.
 
         Raises:
-            ValueError: if an array's shape differs; nothing is overwritten then.
+            ValueError: if an array is missing, or of another shape; nothing is overwritten then.
         """
-        for f in fields(self):
-            mine, theirs = getattr(self, f.name), getattr(other, f.name)
-            if mine.shape != theirs.shape:
+        ours, theirs = self.arrays(), other.arrays()
+        if missing := [name for name in ours if name not in theirs]:
+            raise ValueError(
+                f"can't restore: the state was saved by other observers, without {', '.join(missing)}; restore it into "
+                "a simulator with the same ones"
+            )
+        for name, values in ours.items():
+            if values.shape != theirs[name].shape:
                 raise ValueError(
-                    f"can't restore: {f.name} has shape {theirs.shape}, this simulator's is {mine.shape}; it was saved "
-                    "by another scenario or batch size"
+                    f"can't restore: {name} has shape {theirs[name].shape}, this simulator's is {values.shape}; it was "
+                    "saved by another scenario or number of environments"
                 )
-        for f in fields(self):
-            getattr(self, f.name)[...] = getattr(other, f.name)
+        for name, values in ours.items():
+            values[...] = theirs[name]

@@ -25,7 +25,7 @@ class View:
         x: (B, n) states; agent i's law may read its own slice only.
         edges: (E, 2) directed task edges: agent i = edges[:, 0] is to act on agent j = edges[:, 1], which is -1 where
             j isn't one of the fleet's.
-        known: (E,) whether i knows anything of j's state: it hears j, or observes it.
+        known: (B, E) whether i knows anything of j's state: it receives from j, or estimates it.
         displacement: (B, E, d) position of j, as i hears or estimates it, minus i's own and minus what the task wants
             it to be, in m; 0 where not known.
 
@@ -37,6 +37,12 @@ class View:
     edges: IntArray
     known: np.ndarray
     displacement: FloatArray
+
+    def known_edges(self) -> IntArray:
+        """(N, B) of how many of its task edges each agent knows the other end."""
+        counts = np.zeros((len(self.fleet), len(self.known)), np.int64)
+        np.add.at(counts, self.edges[:, 0], self.known.T)
+        return counts
 
 
 class Law(Protocol):
@@ -54,13 +60,13 @@ class ViewBuilder:
         design: the observers, which say who estimates whom.
         task: the task graph on the same nodes.
         observe: what stands for agents out of earshot: their "estimate", the truth ("oracle"), or nothing ("local").
-        batch: number of environments.
+        num_envs: number of environments.
 
     Raises:
         ValueError: for an unknown `observe`.
     """
 
-    def __init__(self, design: ObserverDesign, task: nx.Graph, observe: Observe, batch: int) -> None:
+    def __init__(self, design: ObserverDesign, task: nx.Graph, observe: Observe, num_envs: int) -> None:
         if observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {observe!r}")
         fleet = design.fleet
@@ -70,19 +76,19 @@ class ViewBuilder:
         self._other = np.ascontiguousarray(position[edges[:, 1]])
         self._kind = np.zeros(len(edges), np.int64)
         for number, (i, j) in enumerate(edges.tolist()):
-            if design.communication.has_edge(i, j) or observe == "oracle":
+            if (j, i) in design.links.index or observe == "oracle":
                 continue
             if observe == "estimate":
                 self._kind[number] = 1
                 self._other[number] += design.states.layout.slot[i, j] - offset[j]
             else:
                 self._kind[number] = 2
-        self._columns = np.zeros((len(edges), fleet.position_dim, batch))
+        self._columns = np.zeros((len(edges), fleet.position_dim, num_envs))
         self.view = View(
             fleet=fleet,
-            x=np.zeros((batch, fleet.n)),
+            x=np.zeros((num_envs, fleet.n)),
             edges=edges,
-            known=self._kind < 2,
+            known=np.broadcast_to(self._kind < 2, (num_envs, len(edges))),
             displacement=self._columns.transpose(2, 0, 1),
         )
 

@@ -11,15 +11,15 @@ from khop_env.scenarios import LawChoice, mixed_fleet, paper
 
 def law_input(simulator):
     """u of the law at the simulator's present state."""
-    loop, state = simulator._loop, simulator._state
-    return loop.law(state.t, loop.views.update(state.x, state.estimate))
+    plant, state = simulator.plant, simulator.state
+    return plant.law(state.t, plant.views.update(state.x, state.memory["estimate"]))
 
 
 @pytest.mark.parametrize("observe", ["estimate", "oracle", "local"])
 @pytest.mark.parametrize("batch", [1, 3])
 def test_tanh_law_is_the_papers_sum_over_task_edges(observe, batch):
     scenario = paper()
-    simulator = scenario.build(law=make_law(scenario.law), observe=observe, batch=batch)
+    simulator = scenario.build(law=make_law(scenario.law), observe=observe, num_envs=batch)
     for _ in range(5):
         simulator.step(0.01)
     u = law_input(simulator).reshape(batch, 8, 2)
@@ -39,7 +39,7 @@ def test_tanh_law_is_the_papers_sum_over_task_edges(observe, batch):
 
 def test_inputs_of_a_mixed_fleet_stay_within_its_limits():
     scenario = mixed_fleet()
-    simulator = scenario.build(law=TanhConsensus(gain=50.0), batch=4)
+    simulator = scenario.build(law=TanhConsensus(gain=50.0), num_envs=4)
     for _ in range(20):
         simulator.step(0.01)
         assert np.all(np.abs(simulator.u) <= simulator.fleet.input_limit)

@@ -40,7 +40,7 @@ def true_view(env):
     acting = type(fleet)([fleet.models[fleet.agent(agent)] for agent in env.agents])
     own = np.concatenate([x[:, fleet.state_slice(fleet.agent(agent))] for agent in env.agents], axis=1)
     columns = np.ascontiguousarray(np.array(displacement).transpose(0, 2, 1))
-    return View(acting, own, np.array(edges), np.array(known), columns.transpose(2, 0, 1)), acting
+    return View(acting, own, np.array(edges), np.tile(known, (len(own), 1)), columns.transpose(2, 0, 1)), acting
 
 
 @pytest.mark.parametrize(("environment", "scenario", "observe", "uniform"), CROSS)

@@ -37,7 +37,7 @@ def test_set_iss_inequality_along_runs(law, size, radius, seed, drifting):
     assert gain is not None
     batch = 6
     seen = Misinformed(law, size, unheard_edges(scenario), np.random.default_rng(seed), batch, 2)
-    simulator = scenario.build(law=seen, observe="oracle", batch=batch)
+    simulator = scenario.build(law=seen, observe="oracle", num_envs=batch)
     simulator.reset(seed)
     limit = consensus_error(simulator.fleet, simulator.x)
     inside = limit <= gain.region(size)

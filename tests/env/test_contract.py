@@ -135,7 +135,7 @@ def test_batched_steps_share_no_memory():
     actions = np.full((3, len(env.agents), 3), 0.5)
     for _ in range(3):
         seen += [env.step(actions), (env.state(),), (env.observations(),)]
-    seen.append(env.reset(copies=[1]))
+    seen.append(env.reset(env_ids=[1]))
     frozen = copy.deepcopy(seen)
     env.step(actions)
     assert same(seen, frozen)
@@ -164,7 +164,7 @@ def test_writing_into_what_was_returned_changes_nothing(environment, name):
         for one in got:
             one["__all__"] = one.pop(spoilt.possible_agents[0])
         saved = spoilt.get_state()
-        for one in (saved.simulator.x, saved.simulator.estimate, saved.inputs):
+        for one in (saved.simulator.x, *saved.simulator.memory.values(), saved.inputs):
             one[...] = np.nan
         for routes in saved.routes:
             routes[...] = np.nan

@@ -92,7 +92,7 @@ def test_estimates_are_seen_by_those_who_make_them_only(environment, name):
                 mine[slot : slot + fleet.models[j].n] = True
 
         def write(simulator, mine=mine):
-            simulator.estimate[mine] += 0.3
+            simulator.memory["estimate"][mine] += 0.3
 
         assert not (edited & mine).any()
         edited |= mine
@@ -107,7 +107,7 @@ def test_estimates_show_in_no_other_mode(environment, name, observe):
     env, _ = in_mid_episode(environment, name, observe=observe)
 
     def write(simulator):
-        simulator.estimate += 0.3
+        simulator.memory["estimate"] += 0.3
 
     assert changed(env, env.get_state(), write) == set()
 
@@ -123,9 +123,9 @@ def test_inputs_draws_and_solver_states_show_to_nobody_else(environment, name):
         simulator.drawn += 0.1
         simulator.u += 0.1
         simulator.g += 0.1
-        simulator.input_estimate += 0.1
-        simulator.eps += 0.1
-        simulator.nu += 0.1
+        simulator.memory["input_estimate"] += 0.1
+        simulator.memory["eps"] += 0.1
+        simulator.memory["nu"] += 0.1
 
     assert changed(env, saved, write) == set()
     acting = {fleet.agent(agent) for agent in env.possible_agents}

@@ -247,7 +247,7 @@ def test_copies_that_there_are_not_are_refused_and_change_nothing(copies, messag
     env, clean = vector(), vector()
     assert same(env.reset(seed=1), clean.reset(seed=1))
     with pytest.raises(ValueError, match=message):
-        env.batched.reset(copies=copies)
+        env.batched.reset(env_ids=copies)
     assert same(env.reset(), clean.reset())
 
 

@@ -32,13 +32,13 @@ def test_design_rule_makes_the_norm_of_rho_what_problem_2_allows(system):
         layout = funnels.layout
         rho = funnels.rho.evaluate(TIMES, np.empty((layout.rows, TIMES.size)))
         delta = funnels.delta.evaluate(TIMES, np.empty((layout.rows, TIMES.size)))
-        for index, target in enumerate(layout.target.tolist()):
-            eta, n, _, _, row, _ = layout.plan[index].tolist()
+        for index, block in enumerate(layout.blocks):
+            target, rows = block.agent, block.rows
             m = definition_of_m(system.design.communication, observers_of(layout, index), target, system.design.relay)
             smallest = np.linalg.eigvalsh(m)[0]
             expected = np.stack([error_bound_of(bounds, target, t) for t in TIMES], axis=1)
-            np.testing.assert_allclose(delta[row : row + n], expected, rtol=1e-12)
-            norm = np.linalg.norm(np.broadcast_to(rho[row : row + n], (eta, n, TIMES.size)), axis=0)
+            np.testing.assert_allclose(delta[rows], expected, rtol=1e-12)
+            norm = np.linalg.norm(np.broadcast_to(rho[rows], (block.observers, block.components, TIMES.size)), axis=0)
             assert np.all(norm <= smallest * expected * (1 + 1e-12))
             np.testing.assert_allclose(norm, smallest * expected, rtol=1e-12)
 
@@ -71,7 +71,7 @@ def largest_start(funnels, center, radius, rng):
     source = np.ascontiguousarray((center + radius * directions).T)
     estimate = np.repeat(center[layout.column_source][:, None], source.shape[1], axis=1)
     xi = np.empty_like(estimate)
-    disagreement(*layout.arrays, estimate, source, xi)
+    disagreement(layout.arrays, estimate, source, xi)
     largest = np.zeros(layout.rows)
     np.maximum.at(largest, layout.column_row, np.abs(xi).max(axis=1))
     return largest
@@ -206,9 +206,8 @@ def test_explicit_step_bound_is_where_euler_stops_damping(system):
     bound = states.explicit_step_bound()
     floor = states.rho.infimum()
     for index in range(len(states.layout.target)):
-        _, n, _, _, row, _ = states.layout.plan[index].tolist()
         m = states.layout.matrix(index)
-        rho = floor[row : row + n].min()
+        rho = floor[states.layout.blocks[index].rows].min()
         for factor, stable in ((0.999, True), (1.001, False)):
             spread = np.linalg.eigvalsh(np.eye(len(m)) - factor * bound[index] * 4.0 / rho**2 * m)
             assert (np.abs(spread).max() < 1.0) == stable

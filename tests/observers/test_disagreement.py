@@ -19,10 +19,9 @@ from strategies import (
     systems,
 )
 
-from khop_env.observers import PairLayout
+from khop_env.observers import PairLayout, Proximal
 from khop_env.observers.disagreement import disagreement
-from khop_env.physics import Fleet, k_hop_neighbors, validate_graph
-from khop_env.simulation import Proximal
+from khop_env.physics import Fleet, Links, k_hop_neighbors, validate_graph
 
 
 @st.composite
@@ -33,7 +32,7 @@ def layouts(draw):
     fleet = Fleet([draw(st.sampled_from(PLANAR)) for _ in graph])
     targets = draw(st.none() | st.sets(st.sampled_from(sorted(graph))))
     layout = PairLayout.build(
-        graph,
+        Links.of(graph),
         k_hop_neighbors(graph, k, relay=relay),
         [model.n for model in fleet.models],
         fleet.state_offset,
@@ -53,7 +52,7 @@ def test_pairs_are_the_k_hop_neighbors_of_every_target(drawn):
     for index, target in enumerate(wanted):
         members = observers_of(layout, index)
         assert set(members) == sets[target]
-        assert len(members) == len(sets[target]) == layout.plan[index, 0]
+        assert len(members) == len(sets[target]) == layout.blocks[index].observers
         for observer in members:
             assert (observer, target) in layout.slot
     assert len(layout.slot) == layout.pairs == sum(len(sets[i]) for i in wanted)
@@ -74,7 +73,7 @@ def test_lemma_1_the_matrices_are_positive_definite(drawn):
 def test_lemma_1_needs_a_connected_graph():
     """Two agents that hear only each other have no path to the target: M would be singular; they aren't observers."""
     graph = nx.Graph([(0, 1), (1, 2), (3, 4)])
-    layout = PairLayout.build(graph, k_hop_neighbors(graph, 4), [1] * 5, range(5), relay=True)
+    layout = PairLayout.build(Links.of(graph), k_hop_neighbors(graph, 4), [1] * 5, range(5), relay=True)
     assert layout.target.tolist() == [0, 2]
 
 
@@ -102,24 +101,23 @@ def test_disagreement_is_the_sum_over_neighbors_and_m_times_the_error(drawn, see
     estimate = scale * rng.normal(size=(layout.size, batch))
     source = scale * rng.normal(size=(fleet.n, batch))
     out = np.full_like(estimate, np.nan)
-    disagreement(*layout.arrays, estimate, source, out)
+    disagreement(layout.arrays, estimate, source, out)
 
     xi, scale = by_definition(graph, k, relay, fleet, layout, estimate, source)
     assert np.all(np.abs(out - xi) <= 1e-14 * scale)
 
     error = estimate - source[layout.column_source]
-    for index, target in enumerate(layout.target.tolist()):
-        eta, n, offset = layout.plan[index, :3].tolist()
-        part = slice(offset, offset + eta * n)
-        m = definition_of_m(graph, observers_of(layout, index), target, relay)
-        product = np.kron(m, np.eye(n)) @ error[part]  # "by appropriate use of the Kronecker product"
+    for index, block in enumerate(layout.blocks):
+        part = block.columns
+        m = definition_of_m(graph, observers_of(layout, index), block.agent, relay)
+        product = np.kron(m, np.eye(block.components)) @ error[part]  # "by appropriate use of the Kronecker product"
         np.testing.assert_allclose(out[part], product, atol=1e-13 * scale.max(), rtol=0)
 
 
 @given(system=systems())
 def test_simulator_reports_disagreements_and_errors_of_both_observers(system):
     """xi = M x_tilde and mu = M g_tilde (the equations of Sections III and V) in what `Simulator` tells its user."""
-    simulator = system.simulator(Proximal(), batch=2)
+    simulator = system.simulator(Proximal(), num_envs=2)
     simulator.step(0.05)
     for funnels, error, difference, estimates, truth in (
         (system.design.states, simulator.errors(), simulator.disagreements(), simulator.estimates, simulator.x),
@@ -150,14 +148,14 @@ def test_simulator_reports_disagreements_and_errors_of_both_observers(system):
 def test_without_relay_nobody_reads_a_state_it_does_not_hear(graph, k):
     """Remark on Assumption 4: x_i enters the disagreement of observers that are its neighbours, and no other's."""
     layout = PairLayout.build(
-        graph, k_hop_neighbors(graph, k, relay=False), [1] * len(graph), range(len(graph)), relay=False
+        Links.of(graph), k_hop_neighbors(graph, k, relay=False), [1] * len(graph), range(len(graph)), relay=False
     )
     estimate = np.zeros((layout.size, 1))
     for target in layout.target.tolist():
         source = np.zeros((len(graph), 1))
         source[target] = np.nan
         out = np.zeros((layout.size, 1))
-        disagreement(*layout.arrays, estimate, source, out)
+        disagreement(layout.arrays, estimate, source, out)
         affected = {pair for pair, slot in layout.slot.items() if np.isnan(out[slot, 0])}
         assert affected == {(neighbor, target) for neighbor in graph[target]}
 
@@ -165,7 +163,7 @@ def test_without_relay_nobody_reads_a_state_it_does_not_hear(graph, k):
 def test_the_paper_s_tree_has_the_published_constant():
     """rho(inf) / delta(inf) = 0.02 / 0.117 of agent 4 (here 3): lambda_min / sqrt(5) = (3 - sqrt 5) / 2 / sqrt 5."""
     graph = nx.Graph([*((i, i + 1) for i in range(6)), (4, 7)])
-    layout = PairLayout.build(graph, k_hop_neighbors(graph, 3), [2] * 8, range(0, 16, 2), relay=True)
+    layout = PairLayout.build(Links.of(graph), k_hop_neighbors(graph, 3), [2] * 8, range(0, 16, 2), relay=True)
     smallest = layout.eigenvalues[layout.target.tolist().index(3), 0]
     assert smallest == pytest.approx((3 - np.sqrt(5)) / 2, rel=1e-14)
     assert smallest / np.sqrt(5) == pytest.approx(0.02 / 0.117, rel=1e-3)

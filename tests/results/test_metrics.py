@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from agents import make_law
-from khop_env.observers import TargetObservers
+from khop_env.observers import Explicit, Extremes, Proximal, TargetObservers
 from khop_env.results import consensus_error, record, summarize
 from khop_env.scenarios import Scenario, paper
-from khop_env.simulation import Explicit, Extremes, Proximal
 
 KEYS = {
     "scenario", "controller", "observe", "seed", "dt", "integrator", "order", "duration", "wall_time_s",
@@ -21,7 +20,7 @@ def summary(scenario: Scenario, dt: float = 0.01, duration: float = 1.0, **optio
     sim = scenario.build(law=make_law(scenario.law), **options).reset(2)
     recording = record(sim, duration, dt)
     return recording, summarize(
-        recording, scenario, seed=2, dt=dt, integrator=sim.integrator, controller="tanh", observe="estimate"
+        recording, scenario, seed=2, dt=dt, observers=sim.observers, controller="tanh", observe="estimate"
     )
 
 
@@ -50,7 +49,7 @@ def test_null_without_input_observers():
 
 
 def test_a_run_that_stopped_early_kept_nothing():
-    _, found = summary(paper(), dt=1e-3, duration=2.0, integrator=Explicit())
+    _, found = summary(paper(), dt=1e-3, duration=2.0, observers=Explicit())
     assert found["funnel_kept"] is False
     assert "left the funnel" in found["error"]
     assert found["duration"] < 2.0
@@ -81,7 +80,7 @@ def test_numbers_that_are_not_finite_are_null():
             paper(),
             seed=2,
             dt=0.01,
-            integrator=Proximal(),
+            observers=Proximal(),
             controller="tanh",
             observe="estimate",
         )
@@ -96,5 +95,5 @@ def test_states_that_ran_away_are_told():
     assert found["diverged"] is False
     for size, expected in ((1e5, False), (1e7, True), (1e300, True)):
         far = replace(recording, x=recording.x * np.linspace(1.0, size, len(recording.x))[:, None])
-        again = summarize(far, paper(), seed=2, dt=0.01, integrator=Proximal(), controller="tanh", observe="estimate")
+        again = summarize(far, paper(), seed=2, dt=0.01, observers=Proximal(), controller="tanh", observe="estimate")
         assert again["diverged"] is expected

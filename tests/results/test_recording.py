@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from agents import make_law
+from khop_env.observers import Explicit, FunnelError, Proximal, SolveError
 from khop_env.results import estimates_table, record, states_table
 from khop_env.scenarios import Scenario, paper
-from khop_env.simulation import Explicit, FunnelError, Proximal, SolveError
 
 
 def simulator(scenario: Scenario, **options):
@@ -38,7 +38,7 @@ def test_samples_are_the_simulators_own_values(recording):
 
 
 def vars_equal(one, other) -> bool:
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_progress_is_told_and_ends_at_one():
 
 
 def test_leaving_the_funnel_loses_nothing():
-    recording = record(simulator(paper(), integrator=Explicit()), 10.0, 1e-3)
+    recording = record(simulator(paper(), observers=Explicit()), 10.0, 1e-3)
     assert isinstance(recording.error, FunnelError)
     assert not recording.completed
     assert 0.0 < recording.time[-1] < 10.0
@@ -113,7 +113,7 @@ def test_a_failed_solve_loses_nothing_before_it():
     def breaks_down(t, view):
         return law(t, view) * (1.0 if t[0] < 0.3 else np.nan)
 
-    recording = record(scenario.build(law=breaks_down, integrator=Proximal(2)).reset(0), 1.0, 0.01)
+    recording = record(scenario.build(law=breaks_down, observers=Proximal(2)).reset(0), 1.0, 0.01)
     assert isinstance(recording.error, SolveError)
     assert 0.28 < recording.time[-1] <= 0.3
     assert np.isfinite(recording.states.estimate).all()
@@ -130,5 +130,5 @@ def test_refusals(changes):
 
 
 def test_more_than_one_environment_is_refused():
-    with pytest.raises(ValueError, match="batch=2"):
-        record(simulator(paper(), batch=2), 1.0, 0.01)
+    with pytest.raises(ValueError, match="num_envs=2"):
+        record(simulator(paper(), num_envs=2), 1.0, 0.01)

@@ -25,7 +25,7 @@ def test_paper_has_the_published_numbers():
     np.testing.assert_allclose(scenario.theta(t), 230 * np.exp(-5 * t) + 1.39)
     layout = scenario.design.states.layout
     agent_4 = 3
-    assert layout.plan[agent_4, 0] == 5
+    assert layout.blocks[agent_4].observers == 5
     assert layout.eigenvalues[agent_4, 0] == pytest.approx((3 - np.sqrt(5)) / 2)
     # 0.02 / 0.117 and 39.27 / 230, both published, are lambda_min(M_4) / sqrt(5) to their own rounding
     gain = scenario.design.states.gain[2 * agent_4]
@@ -48,7 +48,7 @@ def test_estimates_lead_the_team_together_and_keep_their_bounds(factory):
     for _ in range(round(scenario.duration / scenario.dt)):
         simulator.step(scenario.dt)
     assert spread(simulator) < 0.25 * before
-    for ratio in vars(simulator.extremes).values():
+    for ratio in simulator.extremes:
         assert np.all(ratio < 1.0)
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from agents import make_law
+from khop_env.observers import Explicit, Proximal
 from khop_env.scenarios import paper
-from khop_env.simulation import Explicit, Proximal
 
 GAIN = 2.0  # k_c is pinned: with a larger one the controller, not the observer, is the fast part
 STEPS = np.array([1e-2, 5e-3, 2.5e-3, 1.25e-3, 1e-3])
@@ -16,7 +16,7 @@ def closed_loop(integrator, seed=3):
     scenario = paper()
     law = make_law(scenario.law)
     law.gain = GAIN
-    return scenario.build(law=law, integrator=integrator).reset(seed)
+    return scenario.build(law=law, observers=integrator).reset(seed)
 
 
 def trajectory(integrator, dt, times):

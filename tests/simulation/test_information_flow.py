@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from strategies import System, relays, systems
 
 from agents import TanhConsensus
-from khop_env.simulation import BatchedRightHandSide, Proximal
-from khop_env.simulation.closed_loop import ClosedLoop
+from khop_env.observers import BatchedRightHandSide, Proximal
 from khop_env.simulation.state import SimulatorState
 
 
@@ -22,8 +21,7 @@ class Probe:
         simulator = system.simulator(Proximal())
         simulator.step(0.02, self.fleet.input_limit * np.random.default_rng(system.seed).uniform(-1, 1, self.fleet.m))
         self.state = simulator.save()
-        loop = ClosedLoop(self.design, None, None, None, "estimate", 1)
-        self.right_hand_side = BatchedRightHandSide(loop)
+        self.right_hand_side = BatchedRightHandSide(self.design, 1)
         self.funnels = [
             funnels.rho.evaluate(self.state.t, np.ones((funnels.layout.rows, 1)))
             for funnels in (self.design.states, self.design.inputs)
@@ -55,7 +53,7 @@ def test_an_observer_hears_its_neighbors_only(system):
         for state in (beliefs, everything):
             for kind, observer, _, columns in probe.pairs():
                 if observer == j:
-                    estimates = state.input_estimate if kind else state.estimate
+                    estimates = state.memory["input_estimate" if kind else "estimate"]
                     estimates[columns] += rng.normal(size=estimates[columns].shape)
         everything.x[own] += rng.normal(size=everything.x[own].shape)
         everything.g[own] += rng.normal(size=everything.g[own].shape)
@@ -84,7 +82,7 @@ def test_an_observer_does_hear_its_neighbors(system):
         n = columns.stop - columns.start
         for j in graph[a]:
             changed = probe.state.copy()
-            estimates = changed.input_estimate if kind else changed.estimate
+            estimates = changed.memory["input_estimate" if kind else "estimate"]
             if (j, i) in slots[kind]:
                 slot = slots[kind][j, i]
                 estimates[slot : slot + n] += 0.01 * (1.0 + np.abs(estimates[slot : slot + n]))
@@ -113,12 +111,11 @@ def test_a_law_acts_on_what_its_agent_knows(system):
     simulator = system.simulator(Proximal(), law=TanhConsensus(1.0))
     simulator.step(0.02)
     probe, graph, fleet = Probe(system), system.design.communication, system.design.fleet
-    loop, state = simulator._loop, simulator.save()
+    plant, state = simulator.plant, simulator.save()
 
     def inputs(changed: SimulatorState) -> np.ndarray:
-        u = np.zeros((fleet.m, 1))
-        loop.command(changed.t, changed.x, changed.estimate, u)
-        return u
+        plant.actuate(changed)
+        return changed.u.copy()
 
     before = inputs(state)
     for j in graph:
@@ -126,7 +123,7 @@ def test_a_law_acts_on_what_its_agent_knows(system):
         changed.x[fleet.state_slice(j)] += 1.0
         for kind, observer, _, columns in probe.pairs():
             if observer == j and kind == 0:
-                changed.estimate[columns] += 1.0
+                changed.memory["estimate"][columns] += 1.0
         after = inputs(changed)
         for i in graph:
             if i != j and not graph.has_edge(i, j):

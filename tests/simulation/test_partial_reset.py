@@ -1,6 +1,4 @@
-"""Simulator.reset(environments=...): the chosen ones begin anew, and the others keep every bit."""
-
-from dataclasses import fields
+"""Simulator.reset(env_ids=...): the chosen ones begin anew, and the others keep every bit."""
 
 import numpy as np
 import pytest
@@ -9,9 +7,8 @@ from hypothesis import strategies as st
 from strategies import systems
 
 from agents import make_law
-from khop_env.observers import DesignError
+from khop_env.observers import DesignError, Explicit, Proximal
 from khop_env.registry import scenario
-from khop_env.simulation import Explicit, Proximal, SimulatorState
 
 BATCH = 5
 SCENARIOS = ("paper", "convoy", "mixed_fleet", "random_geometric:agents=12")
@@ -21,9 +18,9 @@ every = pytest.mark.parametrize("name", SCENARIOS)
 def everything(simulator):
     """The state's arrays and the running extremes, environments last."""
     saved, seen = simulator.save(), simulator.extremes
-    arrays = {f.name: getattr(saved, f.name) for f in fields(SimulatorState)}
+    arrays = saved.arrays()
     arrays["drawn"] = arrays["drawn"].T
-    return arrays | {f.name: getattr(seen, f.name) for f in fields(seen)}
+    return arrays | seen._asdict()
 
 
 def require_same(one, other, which, others=None):
@@ -35,7 +32,7 @@ def require_same(one, other, which, others=None):
 
 def running(name, batch=BATCH):
     """Some steps into an episode, with inputs that jump."""
-    simulator = scenario(name).build(batch=batch).reset(3)
+    simulator = scenario(name).build(num_envs=batch).reset(3)
     advance(simulator, 3)
     return simulator
 
@@ -52,9 +49,9 @@ def test_others_keep_every_bit_and_the_chosen_begin_as_a_fresh_reset(name, which
     simulator, untouched = running(name), running(name)
     numbers = np.asarray(which, np.int64)
     rest = np.setdiff1d(np.arange(BATCH), numbers)
-    fresh = scenario(name).build(batch=max(len(numbers), 1))
+    fresh = scenario(name).build(num_envs=max(len(numbers), 1))
     fresh.reset([100 + b for b in numbers.tolist()] or 0)
-    simulator.reset(100, environments=which)
+    simulator.reset(100, env_ids=which)
     for _ in range(2):
         now = everything(simulator)
         require_same(now, everything(untouched), rest)
@@ -69,11 +66,11 @@ def test_with_a_law_too(name):
     """The closed loop evaluates the law for all, and moves nothing by that."""
     built = scenario(name)
     law = make_law(built.law)
-    simulator, untouched, fresh = (built.build(batch=3, law=law).reset(5) for _ in range(3))
+    simulator, untouched, fresh = (built.build(num_envs=3, law=law).reset(5) for _ in range(3))
     for _ in range(3):
         simulator.step(0.02)
         untouched.step(0.02)
-    simulator.reset([6], environments=[1])
+    simulator.reset([6], env_ids=[1])
     fresh.reset(5)  # environment 1 from seed 6
     for _ in range(3):
         now = everything(simulator)
@@ -86,13 +83,13 @@ def test_with_a_law_too(name):
 @pytest.mark.parametrize("integrator", [Explicit, lambda: Proximal(1), lambda: Proximal(2, threads=2)])
 def test_with_every_integrator(integrator):
     def build():
-        return scenario("paper").build(batch=3, integrator=integrator()).reset(1)
+        return scenario("paper").build(num_envs=3, observers=integrator()).reset(1)
 
     simulator, untouched, fresh = build(), build(), build()
     for _ in range(3):
         simulator.step(1e-5, np.zeros(16))
         untouched.step(1e-5, np.zeros(16))
-    simulator.reset(1, environments=[2])
+    simulator.reset(1, env_ids=[2])
     require_same(everything(simulator), everything(untouched), [0, 1])
     require_same(everything(simulator), everything(fresh), [2])
 
@@ -107,7 +104,7 @@ def test_of_any_system(system, batch, data):
     for one in (simulator, untouched):
         one.step(0.01, u)
         one.step(0.01, -u)
-    simulator.reset(77, environments=which)
+    simulator.reset(77, env_ids=which)
     fresh = system.simulator(Proximal(2), batch).reset(77)
     require_same(everything(simulator), everything(untouched), np.setdiff1d(np.arange(batch), which))
     require_same(everything(simulator), everything(fresh), which)
@@ -118,7 +115,7 @@ def test_initial_states_and_generators_for_the_chosen():
     simulator = running("paper")
     before, n = everything(simulator), simulator.fleet.n
     x0 = np.linspace(-1.0, 1.0, 2 * n).reshape(2, n)
-    simulator.reset(9, x0, environments=[4, 1])
+    simulator.reset(9, x0, env_ids=[4, 1])
     np.testing.assert_array_equal(simulator.x[[4, 1]], x0)
     simulator.reset([np.random.default_rng(9)], x0[0], [3])
     np.testing.assert_array_equal(simulator.x[3], x0[0])
@@ -129,18 +126,18 @@ def test_initial_states_and_generators_for_the_chosen():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"environments": [0, 5]}, ValueError, r"environments must be different ones among 0 to 4; got \[0, 5\]"),
-        ({"environments": [-1]}, ValueError, r"among 0 to 4; got \[-1\]"),
-        ({"environments": [1, 1]}, ValueError, r"different ones among 0 to 4; got \[1, 1\]"),
-        ({"environments": [[0, 1]]}, ValueError, r"among 0 to 4; got \[\[0, 1\]\]"),
-        ({"environments": 2}, ValueError, r"among 0 to 4; got 2"),
-        ({"environments": [0.5]}, ValueError, r"among 0 to 4; got \[0.5\]"),
-        ({"environments": np.eye(5, dtype=bool)[1]}, ValueError, r"not a mask: give np.flatnonzero\(mask\)"),
-        ({"environments": [0, 1], "seed": [1]}, ValueError, "expected one seed or 2, one per environment; got 1"),
-        ({"environments": [0, 1], "seed": [1, -2]}, ValueError, "non-negative"),
-        ({"environments": [0, 1], "x0": np.zeros((5, 16))}, ValueError, r"of shape \(16,\) or \(2, 16\)"),
-        ({"environments": [0, 1], "x0": np.full(16, np.nan)}, ValueError, "x0 must be finite"),
-        ({"environments": [0, 1], "x0": np.full(16, 1e3)}, DesignError, "can't start inside their funnel"),
+        ({"env_ids": [0, 5]}, ValueError, r"env_ids must be different ones among 0 to 4; got \[0, 5\]"),
+        ({"env_ids": [-1]}, ValueError, r"among 0 to 4; got \[-1\]"),
+        ({"env_ids": [1, 1]}, ValueError, r"different ones among 0 to 4; got \[1, 1\]"),
+        ({"env_ids": [[0, 1]]}, ValueError, r"among 0 to 4; got \[\[0, 1\]\]"),
+        ({"env_ids": 2}, ValueError, r"among 0 to 4; got 2"),
+        ({"env_ids": [0.5]}, ValueError, r"among 0 to 4; got \[0.5\]"),
+        ({"env_ids": np.eye(5, dtype=bool)[1]}, ValueError, r"not a mask: give np.flatnonzero\(mask\)"),
+        ({"env_ids": [0, 1], "seed": [1]}, ValueError, "expected one seed or 2, one per environment; got 1"),
+        ({"env_ids": [0, 1], "seed": [1, -2]}, ValueError, "non-negative"),
+        ({"env_ids": [0, 1], "x0": np.zeros((5, 16))}, ValueError, r"of shape \(16,\) or \(2, 16\)"),
+        ({"env_ids": [0, 1], "x0": np.full(16, np.nan)}, ValueError, "x0 must be finite"),
+        ({"env_ids": [0, 1], "x0": np.full(16, 1e3)}, DesignError, "can't start inside their funnel"),
     ],
 )
 def test_mistakes_are_refused_and_change_nothing(arguments, error, message):
@@ -153,6 +150,6 @@ def test_mistakes_are_refused_and_change_nothing(arguments, error, message):
 
 
 def test_all_environments_by_name_are_all():
-    """environments=range(B) is what leaving them out is."""
-    one, other = running("mixed_fleet", 3).reset(8), running("mixed_fleet", 3).reset(8, environments=range(3))
+    """env_ids=range(B) is what leaving them out is."""
+    one, other = running("mixed_fleet", 3).reset(8), running("mixed_fleet", 3).reset(8, env_ids=range(3))
     require_same(everything(one), everything(other), np.arange(3))

@@ -1,7 +1,6 @@
 """Same seed, same bits: over runs, batch sizes, threads, and saving and restoring in the middle."""
 
 import pickle
-from dataclasses import fields
 
 import networkx as nx
 import numpy as np
@@ -11,28 +10,26 @@ from hypothesis import strategies as st
 from strategies import SmoothSignals, systems
 
 from agents import TanhConsensus, make_law
-from khop_env.observers import Exponential, ObserverDesign
+from khop_env.observers import Explicit, Exponential, ObserverDesign, Proximal
+from khop_env.observers.solve import LANES
 from khop_env.physics import BandLimitedNoise, DriftingIntegrator, Fleet, Sinusoid, Unicycle
 from khop_env.scenarios import paper
-from khop_env.simulation import Explicit, InitialSet, Proximal, Simulator, SimulatorState
-from khop_env.simulation.proximal import LANES
+from khop_env.simulation import InitialSet, Simulator, SimulatorState
 
 INTEGRATORS = {"explicit": Explicit, "order 1": lambda: Proximal(1), "order 2": lambda: Proximal(2)}
 
 
 def assert_same_bits(one: SimulatorState, other: SimulatorState) -> None:
     """All arrays of two states are equal, NaN included."""
-    for f in fields(SimulatorState):
-        np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name), err_msg=f.name)
+    for name, values in one.arrays().items():
+        np.testing.assert_array_equal(values, other.arrays()[name], err_msg=name)
 
 
 def environment(state: SimulatorState, b: int) -> SimulatorState:
     """Environment b of a batch as a state of its own."""
-    alone = state.copy()
-    for f in fields(SimulatorState):
-        array = getattr(state, f.name)
-        setattr(alone, f.name, array[b : b + 1] if f.name in ("t", "drawn") else array[:, b : b + 1])
-    return alone
+    memory = {name: values[:, b : b + 1] for name, values in state.memory.items()}
+    parts = {name: getattr(state, name)[..., b : b + 1] for name in ("t", "x", "u", "g")}
+    return SimulatorState(**parts, drawn=state.drawn[b : b + 1], memory=memory, links=state.links)
 
 
 def steps(integrator: str) -> tuple[float, int]:
@@ -71,8 +68,8 @@ def large_batch(batch: int, threads: int) -> Simulator:
         disturbance=Sinusoid(0.3) + BandLimitedNoise(0.2),
         law=TanhConsensus(),
         task=nx.cycle_graph(4),
-        integrator=Proximal(2, threads),
-        batch=batch,
+        observers=Proximal(2, threads),
+        num_envs=batch,
     ).reset(7)
     for _ in range(5):
         simulator.step(0.05)
@@ -104,7 +101,7 @@ def test_same_seed_same_bits_and_other_seeds_differ(integrator):
     dt, count = steps(integrator)
 
     def run(seed):
-        simulator = paper().build(law=make_law("tanh"), integrator=INTEGRATORS[integrator]()).reset(seed)
+        simulator = paper().build(law=make_law("tanh"), observers=INTEGRATORS[integrator]()).reset(seed)
         for _ in range(count):
             simulator.step(dt)
         return simulator
@@ -122,7 +119,7 @@ def test_same_seed_same_bits_and_other_seeds_differ(integrator):
 
 def test_seeds_may_be_given_one_by_one_and_as_generators():
     """seed + b, a list of seeds, and generators of those seeds are the same thing; rows differ from each other."""
-    simulator = paper().build(batch=3)
+    simulator = paper().build(num_envs=3)
     by_number = simulator.reset(5).save()
     assert_same_bits(simulator.reset([5, 6, 7]).save(), by_number)
     assert_same_bits(simulator.reset([np.random.default_rng(seed) for seed in (5, 6, 7)]).save(), by_number)
@@ -163,12 +160,12 @@ def test_saved_and_restored_runs_continue_bit_for_bit(integrator, system, batch,
 
 def test_a_state_of_another_shape_is_refused_and_changes_nothing():
     """Batch size and scenario have to match."""
-    simulator = paper().build(batch=2)
+    simulator = paper().build(num_envs=2)
     before = simulator.save()
     with pytest.raises(ValueError, match=r"t has shape \(3,\), this simulator's is \(2,\)"):
-        simulator.restore(paper().build(batch=3).save())
-    other = paper().replace(k=2, task=nx.empty_graph(8)).build(batch=2)
-    with pytest.raises(ValueError, match=r"estimate has shape .* saved by another scenario or batch size"):
+        simulator.restore(paper().build(num_envs=3).save())
+    other = paper().replace(k=2, task=nx.empty_graph(8)).build(num_envs=2)
+    with pytest.raises(ValueError, match=r"estimate has shape .* saved by another scenario or number of environments"):
         simulator.restore(other.save())
     assert_same_bits(simulator.save(), before)
 
@@ -178,8 +175,8 @@ def test_states_copy_and_pickle_independently():
     state = paper().build().save()
     copy, loaded = state.copy(), pickle.loads(pickle.dumps(state))
     assert_same_bits(loaded, state)
-    for f in fields(SimulatorState):
-        assert not np.shares_memory(getattr(copy, f.name), getattr(state, f.name))
+    for name, values in state.arrays().items():
+        assert not np.shares_memory(copy.arrays()[name], values)
     state.x[...] = np.nan
     assert np.all(np.isfinite(copy.x))
 
@@ -202,7 +199,7 @@ def test_reading_does_not_change_a_run():
 
 def test_a_pickled_simulator_plays_the_same_episode():
     """Worker processes get simulators by pickle; threads are not carried along."""
-    simulator = paper().build(law=make_law("tanh"), integrator=Proximal(threads=2)).reset(4)
+    simulator = paper().build(law=make_law("tanh"), observers=Proximal(threads=2)).reset(4)
     simulator.step(0.01)
     clone = pickle.loads(pickle.dumps(simulator))
     for one in (simulator, clone):

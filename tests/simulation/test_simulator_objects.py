@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from agents import make_law
-from khop_env.observers import DesignError, Exponential
+from khop_env.observers import DesignError, Explicit, Exponential, FunnelError, Proximal, SolveError
 from khop_env.physics import SingleIntegrator
 from khop_env.scenarios import Scenario, mixed_fleet, paper
-from khop_env.simulation import Explicit, FunnelError, Proximal, SolveError
 
 
 def same(one, other):
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
+    return all(np.array_equal(values, other.arrays()[name]) for name, values in one.arrays().items())
 
 
 @pytest.mark.parametrize("factory", [paper, mixed_fleet])
@@ -24,7 +23,7 @@ def same(one, other):
 def test_a_copy_continues_bit_for_bit_and_on_its_own(factory, duplicate, integrator):
     scenario = factory()
     dt = 1e-6 if isinstance(integrator, Explicit) else 0.01
-    simulator = scenario.build(law=make_law(scenario.law), integrator=integrator, batch=2)
+    simulator = scenario.build(law=make_law(scenario.law), observers=integrator, num_envs=2)
     for _ in range(5):
         simulator.step(dt)
     twin = duplicate(simulator)
@@ -42,9 +41,9 @@ def test_one_integrator_may_be_given_to_several_simulators(make):
     shared, scenario = make(), paper()
     law = make_law(scenario.law)
     dt = 1e-5 if make is Explicit else 0.01
-    alone = scenario.build(law=law, integrator=make())
-    first = scenario.build(law=law, integrator=shared)
-    mixed_fleet().build(law=make_law("tanh"), integrator=shared)
+    alone = scenario.build(law=law, observers=make())
+    first = scenario.build(law=law, observers=shared)
+    mixed_fleet().build(law=make_law("tanh"), observers=shared)
     for _ in range(10):
         alone.step(dt)
         first.step(dt)
@@ -72,7 +71,7 @@ def test_a_state_that_nobody_estimates_may_not_become_nan_unseen(integrator, gra
         delta=Exponential(20.0, 1.0, 1.0),
         theta=Exponential(20.0, 1.0, 1.0),
     )
-    simulator = scenario.build(law=make_law("tanh"), integrator=integrator)
+    simulator = scenario.build(law=make_law("tanh"), observers=integrator)
     for dt in (0.01, 0.01, 0.01, 0.01, 0.02):  # the last stage that evaluates the drift is at 0.046 s
         simulator.step(dt)
     before = simulator.save()
@@ -92,7 +91,7 @@ def test_a_law_that_raises_leaves_the_state_before_the_step(make):
             raise KeyError("the law's own mistake")
         return law(t, view)
 
-    simulator = scenario.build(law=failing, integrator=make())
+    simulator = scenario.build(law=failing, observers=make())
     while len(calls) < 5:
         simulator.step(1e-5)
     before = simulator.save()
@@ -114,7 +113,7 @@ def test_an_input_that_jumps_out_of_an_explicit_observers_funnel_is_said_to_have
         theta=Exponential(500.0, 0.5, 5.0),
         radius=0.1,
     )
-    simulator = scenario.build(integrator=Explicit())
+    simulator = scenario.build(observers=Explicit())
     for _ in range(3000):
         simulator.step(1e-3)
     before = simulator.save()

@@ -118,7 +118,7 @@ class Beliefs:
         fleet, layout = design.fleet, design.states.layout
         slots = {target: offset for (who, target), offset in layout.slot.items() if who == observer}
         self.targets = sorted(slots)
-        first = {int(target): int(row) for target, row in zip(layout.target, layout.plan[:, 4], strict=True)}
+        first = {block.agent: block.rows.start for block in layout.blocks}
         d = min(2, fleet.position_dim)
         place = [fleet.position_index[j, :d] - fleet.state_offset[j] for j in self.targets]
         self._columns = np.array([slots[j] + p for j, p in zip(self.targets, place, strict=True)], int).reshape(-1, d)

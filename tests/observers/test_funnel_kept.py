@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import System, systems
 
+from khop_env.observers import Proximal
 from khop_env.physics import SurfaceVessel
-from khop_env.simulation import Proximal, Simulator
+from khop_env.simulation import Simulator
 
 STEPS = st.floats(np.log(1e-4), 0.0).map(lambda exponent: float(np.exp(exponent)))
 """Any step from 1e-4 s to 1 s, as likely in each decade."""
@@ -43,7 +44,7 @@ def test_funnels_are_kept_for_any_step_and_any_jump_of_input_and_state(order, sy
     rng = np.random.default_rng(system.seed)
     reach = 10.0 ** (min(decades, 0.0) if has_vessels(system) else decades)
     for _ in range(12):
-        simulator._state.x[...] = reach * rng.uniform(-1.0, 1.0, simulator._state.x.shape)
+        simulator.state.x[...] = reach * rng.uniform(-1.0, 1.0, simulator.state.x.shape)
         u = reach * rng.choice((-1.0, 0.0, 0.3, 1.0), (batch, system.design.fleet.m))
         simulator.step(dt * (10.0 ** rng.uniform(-1.0, 0.0) if vary else 1.0), u)
         assert_inside(simulator)
@@ -73,11 +74,10 @@ def test_an_episode_may_resume_anywhere(system, dt, where):
     simulator = system.simulator(Proximal(), 2)
     saved = simulator.save()
     rng = np.random.default_rng(system.seed)
-    saved.estimate[...] = 100.0 * where * rng.normal(size=saved.estimate.shape)
-    saved.input_estimate[...] = 100.0 * where * rng.normal(size=saved.input_estimate.shape)
-    saved.eps[...] = rng.normal(size=saved.eps.shape)
+    for name, reach in (("estimate", 100.0 * where), ("input_estimate", 100.0 * where), ("eps", 1.0)):
+        saved.memory[name][...] = reach * rng.normal(size=saved.memory[name].shape)
     saved.t[...] = rng.uniform(0.0, 20.0, 2)
     simulator.restore(saved)
-    simulator._extremes[...] = 0.0  # the restored state needn't be inside
+    simulator.restart_extremes()  # the restored state needn't be inside
     simulator.step(dt, np.zeros(system.design.fleet.m))
     assert_inside(simulator)

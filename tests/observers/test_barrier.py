@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from khop_env.observers.disagreement import barrier_curvature, correction, transformation, transformation_slope
 from khop_env.observers.layout import PairLayout
-from khop_env.physics import k_hop_neighbors
-from khop_env.simulation.proximal import _barrier, eps_near_impulse
+from khop_env.observers.solve import _barrier, eps_near_impulse
+from khop_env.physics import Links, k_hop_neighbors
 
 mpmath.mp.dps = 60
 ULP = 2.0**-52
@@ -124,12 +124,12 @@ def test_correction_is_the_paper_s_formula(sizes, seed):
     n, batch = sizes
     rng = np.random.default_rng(seed)
     graph = nx.path_graph(6)
-    layout = PairLayout.build(graph, k_hop_neighbors(graph, 4), [n] * 6, np.arange(6) * n, relay=True)
+    layout = PairLayout.build(Links.of(graph), k_hop_neighbors(graph, 4), [n] * 6, np.arange(6) * n, relay=True)
     rho = np.exp(rng.normal(size=(layout.rows, batch)))
     expected_e = rng.uniform(-1, 1, (layout.size, batch))
     xi = expected_e * rho[layout.column_row]
     e, out = np.empty_like(xi), np.empty_like(xi)
-    correction(layout.plan, xi, rho, e, out)
+    correction(layout.arrays, xi, rho, e, out)
     np.testing.assert_allclose(e, expected_e, rtol=1e-15, atol=1e-300)
     eps = np.log((1 + e) / (1 - e))
     np.testing.assert_allclose(out, -(2 / (1 - e**2)) * eps / rho[layout.column_row], rtol=1e-10, atol=1e-14)

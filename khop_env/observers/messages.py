@@ -11,10 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from khop_env.observers import FloatArray, Funnels, PerformanceFunction
+from khop_env.observers.base import PlantState
+from khop_env.observers.design import Funnels, ObserverDesign
+from khop_env.observers.explicit import Derivative
+from khop_env.observers.layout import FloatArray
+from khop_env.observers.performance import PerformanceFunction
 from khop_env.physics import AgentModel
-from khop_env.simulation.closed_loop import ClosedLoop
-from khop_env.simulation.state import SimulatorState
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Message:
 
 
 @dataclass
-class Observation:
+class HeldEstimate:
     """What one agent holds about one target: design data, fixed, and its two estimates."""
 
     model: AgentModel
@@ -56,10 +58,10 @@ class ObserverAgent:
     Args:
         index: which agent it is.
         targets: what it holds about each agent that it estimates. `peers` are its neighbours that estimate the target
-            too; `relays` those that tell it the target's true state: common neighbours, or the target itself.
+            too; `relays` those that send it the target's true state: common neighbours, or the target itself.
     """
 
-    def __init__(self, index: int, targets: dict[int, Observation]) -> None:
+    def __init__(self, index: int, targets: dict[int, HeldEstimate]) -> None:
         self.index, self.targets = index, targets
 
     def message(
@@ -80,14 +82,14 @@ class ObserverAgent:
         Without an input observer of that target the second and the fourth are empty.
         """
         target = self.targets[i]
-        told = [inbox[p].relayed.get(i, (inbox[p].state, inbox[p].input_map)) for p in target.relays]
-        others = [inbox[p].estimates[i] for p in target.peers] + [state for state, _ in told]
+        relayed = [inbox[p].relayed.get(i, (inbox[p].state, inbox[p].input_map)) for p in target.relays]
+        others = [inbox[p].estimates[i] for p in target.peers] + [state for state, _ in relayed]
         rate, e = _correction(t, _disagreement(target.estimate, others), target.rho)
         if target.drift_known:
             rate = rate + target.model.drift(np.array([t]), target.estimate[None])[0]
         if target.omega is None:
             return rate, np.zeros(0), e, np.zeros(0)
-        others = [inbox[p].input_estimates[i] for p in target.peers] + [input_map for _, input_map in told]
+        others = [inbox[p].input_estimates[i] for p in target.peers] + [input_map for _, input_map in relayed]
         input_rate, q = _correction(t, _disagreement(target.input_estimate, others), target.omega)
         return rate + target.input_estimate, input_rate, e, q
 
@@ -111,12 +113,12 @@ class MessagePassing:
     """The observers' derivative, agent by agent and message by message; a `RightHandSide`.
 
     Args:
-        loop: the closed loop whose observers these are.
+        design: the observers.
+        num_envs: number of environments B.
     """
 
-    def __init__(self, loop: ClosedLoop) -> None:
-        self._loop = loop
-        design, graph = loop.design, loop.design.communication
+    def __init__(self, design: ObserverDesign, num_envs: int) -> None:
+        self._design, graph = design, design.communication
         rho = _per_target(design.states)
         omega = _per_target(design.inputs)
         self.agents: list[ObserverAgent] = []
@@ -125,7 +127,7 @@ class MessagePassing:
             targets = {}
             for i in design.neighborhoods[a]:  # graph distance is symmetric: a estimates whoever estimates a
                 relays = neighbors & set(graph[i]) if design.relay else neighbors & {i}
-                targets[i] = Observation(
+                targets[i] = HeldEstimate(
                     design.fleet.models[i],
                     design.options[i].drift,
                     rho[i],
@@ -135,28 +137,24 @@ class MessagePassing:
                 )
             self.agents.append(ObserverAgent(a, targets))
 
-    def __call__(
-        self, state: SimulatorState, rho: FloatArray, omega: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def __call__(self, state: PlantState, rho: FloatArray, omega: FloatArray) -> Derivative:
         """See `RightHandSide`."""
-        dy, e = np.zeros_like(state.estimate), np.zeros_like(state.estimate)
-        dghat, q = np.zeros_like(state.input_estimate), np.zeros_like(state.input_estimate)
+        estimate, input_estimate = state.memory["estimate"], state.memory["input_estimate"]
+        found = Derivative(*(np.zeros_like(each) for each in (estimate, input_estimate) * 2))
         for env in range(state.t.size):
-            self._one(state, env, dy, dghat, e, q)
-        return dy, dghat, e, q
+            self._in_one_environment(state, env, found)
+        return found
 
-    def _one(
-        self, state: SimulatorState, env: int, dy: FloatArray, dghat: FloatArray, e: FloatArray, q: FloatArray
-    ) -> None:
-        design, fleet = self._loop.design, self._loop.fleet
+    def _in_one_environment(self, state: PlantState, env: int, found: Derivative) -> None:
+        design, fleet, memory = self._design, self._design.fleet, state.memory
         slot, input_slot = design.states.layout.slot, design.inputs.layout.slot
         for agent in self.agents:
             for i, target in agent.targets.items():
                 at, n = slot[agent.index, i], target.model.n
-                target.estimate = state.estimate[at : at + n, env]
+                target.estimate = memory["estimate"][at : at + n, env]
                 if target.omega is not None:
                     at = input_slot[agent.index, i]
-                    target.input_estimate = state.input_estimate[at : at + n, env]
+                    target.input_estimate = memory["input_estimate"][at : at + n, env]
 
         own = [(state.x[fleet.state_slice(i), env], state.g[fleet.state_slice(i), env]) for i in range(len(fleet))]
         graph = design.communication
@@ -169,14 +167,12 @@ class MessagePassing:
             for i, target in agent.targets.items():
                 rate, input_rate, normalized, input_normalized = agent.derivative(float(state.t[env]), i, inbox)
                 at, n = slot[agent.index, i], target.model.n
-                dy[at : at + n, env], e[at : at + n, env] = rate, normalized
+                found.estimate[at : at + n, env], found.e[at : at + n, env] = rate, normalized
                 if target.omega is not None:
                     at = input_slot[agent.index, i]
-                    dghat[at : at + n, env], q[at : at + n, env] = input_rate, input_normalized
+                    found.input_estimate[at : at + n, env], found.q[at : at + n, env] = input_rate, input_normalized
 
 
 def _per_target(funnels: Funnels) -> dict[int, tuple[PerformanceFunction, ...]]:
     layout, functions = funnels.layout, funnels.rho.functions
-    return {
-        int(i): functions[row : row + n] for i, (_, n, _, _, row, _) in zip(layout.target, layout.plan, strict=True)
-    }
+    return {block.agent: functions[block.rows] for block in layout.blocks}

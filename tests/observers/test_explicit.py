@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from strategies import SmoothSignals, systems
 
 from agents import make_law
-from khop_env.observers import Exponential, ObserverDesign
+from khop_env.observers import Explicit, Exponential, FunnelError, ObserverDesign
 from khop_env.observers.disagreement import correction, disagreement
 from khop_env.physics import DriftingIntegrator, Fleet
 from khop_env.scenarios import paper
-from khop_env.simulation import Explicit, FunnelError, InitialSet, Simulator
+from khop_env.simulation import InitialSet, Simulator
 
 MESSAGE = re.compile(
     r"the explicit step left the funnel: (?P<kind>state|input) observer of '(?P<target>\w+)' in '(?P<observer>\w+)', "
@@ -39,7 +39,7 @@ def test_too_long_a_step_leaves_the_funnel_and_says_where(seed):
 
     The error names observer, component, time, |e| and a step; the state is the last one inside, and finite.
     """
-    simulator = paper().build(law=make_law("tanh"), integrator=Explicit(), batch=2).reset(seed)
+    simulator = paper().build(law=make_law("tanh"), observers=Explicit(), num_envs=2).reset(seed)
     found = step_until_it_leaves(simulator, 1e-3)
     layout, fleet = simulator.design.states.layout, simulator.fleet
     assert found["kind"] == "state"
@@ -57,7 +57,7 @@ def test_too_long_a_step_leaves_the_funnel_and_says_where(seed):
     with pytest.raises(FunnelError) as again:  # nothing of the failed step is left behind
         simulator.step(1e-3)
     assert MESSAGE.match(str(again.value)).groupdict() == found.groupdict()
-    np.testing.assert_array_equal(simulator.save().estimate, state.estimate)
+    np.testing.assert_array_equal(simulator.estimates, state.memory["estimate"].T)
 
 
 @pytest.mark.parametrize("dt", [4e-4, 1e-3, 3e-3, 1e-2])
@@ -67,7 +67,7 @@ def test_the_step_it_suggests_is_stable_there(dt):
     While the funnel hardly narrows, that is: the suggestion is of that instant.
     """
     for seed in range(4):
-        simulator = paper().build(law=make_law("tanh"), integrator=Explicit()).reset(seed)
+        simulator = paper().build(law=make_law("tanh"), observers=Explicit()).reset(seed)
         if dt < 5e-4 and seed:
             break
         stable = float(step_until_it_leaves(simulator, dt)["stable"])
@@ -85,7 +85,7 @@ def test_the_design_s_bound_on_the_step_separates_what_can_work_from_what_cannot
     steady = scenario.build(law=law).reset(1)
     for _ in range(300):
         steady.step(0.01)
-    simulator = scenario.build(law=law, integrator=Explicit())
+    simulator = scenario.build(law=law, observers=Explicit())
     simulator.restore(steady.save())
     for _ in range(1000):
         simulator.step(1e-5)
@@ -117,20 +117,20 @@ def test_one_step_is_euler_s_of_the_paper_s_equations(system):
     f = np.concatenate([m.drift(t, x[0, fleet.state_slice(i)]) for i, m in enumerate(fleet.models)])
     np.testing.assert_allclose(simulator.x[0], x[0] + dt * (f + g + w), rtol=1e-15, atol=1e-15)
     for kind, funnels, estimate, source, after in (
-        ("state", design.states, before.estimate, before.x, simulator.estimates),
-        ("input", design.inputs, before.input_estimate, before.g, simulator.input_estimates),
+        ("state", design.states, before.memory["estimate"], before.x, simulator.estimates),
+        ("input", design.inputs, before.memory["input_estimate"], before.g, simulator.input_estimates),
     ):
         layout = funnels.layout
         xi, e, rate = (np.zeros_like(estimate) for _ in range(3))
-        disagreement(*layout.arrays, estimate, source, xi)
-        correction(layout.plan, xi, funnels.rho.evaluate(t, np.empty((layout.rows, 1))), e, rate)
+        disagreement(layout.arrays, estimate, source, xi)
+        correction(layout.arrays, xi, funnels.rho.evaluate(t, np.empty((layout.rows, 1))), e, rate)
         for (observer, target), slot in layout.slot.items():
             own = slice(slot, slot + fleet.models[target].n)
             if kind == "state" and design.options[target].drift:
                 rate[own, 0] += fleet.models[target].drift(t, estimate[own, 0])
             if kind == "state" and design.options[target].input_observer:
                 other = design.inputs.layout.slot[observer, target]
-                rate[own, 0] += before.input_estimate[other : other + fleet.models[target].n, 0]
+                rate[own, 0] += before.memory["input_estimate"][other : other + fleet.models[target].n, 0]
         np.testing.assert_allclose(after[0], (estimate + dt * rate)[:, 0], rtol=1e-14, atol=1e-14)
 
 
@@ -140,7 +140,7 @@ def test_an_input_that_jumps_out_of_its_funnel_is_an_error_too():
     """
     fleet, bound = Fleet([DriftingIntegrator(input_limit=5.0)] * 3), Exponential(20.0, 0.5, 50.0)
     design = ObserverDesign(fleet, nx.path_graph(3), 2, Exponential(10.0, 1.0, 50.0), bound)
-    simulator = Simulator(design, InitialSet(np.zeros(6), np.ones(6)), integrator=Explicit())
+    simulator = Simulator(design, InitialSet(np.zeros(6), np.ones(6)), observers=Explicit())
     for _ in range(2000):
         simulator.step(1e-4, np.zeros(6))
     before = simulator.save()
@@ -148,7 +148,8 @@ def test_an_input_that_jumps_out_of_its_funnel_is_an_error_too():
         simulator.step(1e-4, np.full(6, 0.6))  # M = [1]: mu = -0.6 and omega = 0.50
     assert "nan" not in str(caught.value)
     assert "'drifter_" in str(caught.value)
+    after = simulator.save().arrays()
     for name in ("t", "x", "estimate", "input_estimate"):
-        np.testing.assert_array_equal(getattr(simulator.save(), name), getattr(before, name))
+        np.testing.assert_array_equal(after[name], before.arrays()[name])
     simulator.step(1e-4, np.full(6, 0.2))
     assert np.all(simulator.extremes.input_normalized < 1.0)

@@ -23,21 +23,45 @@ of the returned estimates is rho e, whatever the tolerance.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import expm1, log
-
-if TYPE_CHECKING:
-    from khop_env.observers.layout import FloatArray, IntArray
+from khop_env.observers.layout import FloatArray, IntArray, PairArrays
 
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
 MAX_ITERATIONS = 200
 LANES = 64  # scalar problems solved side by side: enough to fill vector registers, few enough to stay in cache
 _JUMP = 0.25  # in eps: beyond it a warm start isn't worth more than none
 _LONG_STEP = 1.0  # in eps: beyond it exp is not nearly linear
+
+
+class _Work(NamedTuple):
+    """Scratch memory of the solve of one target, (observers, lanes) each: a lane is one component in one environment.
+
+    Attributes:
+        b: right-hand side of e(z) + s M z = b.
+        e: normalised disagreement.
+        z: impulse phi'(e).
+        gain: d eps / dz.
+        dz: Newton's step in z.
+        pivot: D of the factorisation L D L', inverted.
+        entry: a row of the matrix that is being eliminated.
+        eps: T(e), the unknown.
+        answer: the impulse that Newton's method has arrived at.
+    """
+
+    b: FloatArray
+    e: FloatArray
+    z: FloatArray
+    gain: FloatArray
+    dz: FloatArray
+    pivot: FloatArray
+    entry: FloatArray
+    eps: FloatArray
+    answer: FloatArray
 
 
 @inlined
@@ -86,28 +110,26 @@ def _barriers(
 
 @compiled
 def _newton_step(
-    members: tuple[int, int, int],
-    diagonal: FloatArray,
-    link_start: IntArray,
-    link: IntArray,
-    first: IntArray,
+    eta: int,
+    pair: int,
+    lanes: int,
+    pairs: PairArrays,
     scale: FloatArray,
-    work: FloatArray,
+    work: _Work,
     lower: FloatArray,
     row_start: IntArray,
 ) -> None:
     """Solve (diag(de/dz) + s M) dz = b - e - s M z for all lanes, by L D L' in the profile of M (no square roots)."""
-    eta, pair, lanes = members
-    b, e, z, gain, dz, pivot, entry = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    b, e, z, gain, dz, pivot, entry = work.b, work.e, work.z, work.gain, work.dz, work.pivot, work.entry
     for a in range(eta):
-        d, begin = diagonal[pair + a], first[pair + a]
+        d, begin = pairs.diagonal[pair + a], pairs.first[pair + a]
         for lane in range(lanes):
             dz[a, lane] = d * z[a, lane]
         for j in range(begin, a):
             for lane in range(lanes):
                 entry[j, lane] = 0.0
-        for k in range(link_start[pair + a], link_start[pair + a + 1]):
-            other = link[k]
+        for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
+            other = pairs.entry[k]
             for lane in range(lanes):
                 dz[a, lane] -= z[other, lane]
             if other < a:
@@ -118,7 +140,7 @@ def _newton_step(
             dz[a, lane] = b[a, lane] - normalized - scale[lane] * dz[a, lane]
             pivot[a, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * d
         for j in range(begin, a):
-            for k in range(max(begin, first[pair + j]), j):
+            for k in range(max(begin, pairs.first[pair + j]), j):
                 factor = row_start[j] + k
                 for lane in range(lanes):
                     entry[j, lane] -= entry[k, lane] * lower[factor, lane]
@@ -135,25 +157,18 @@ def _newton_step(
         for lane in range(lanes):
             dz[a, lane] *= pivot[a, lane]
     for a in range(eta - 1, 0, -1):
-        for j in range(first[pair + a], a):
+        for j in range(pairs.first[pair + a], a):
             factor = row_start[a] + j
             for lane in range(lanes):
                 dz[j, lane] -= lower[factor, lane] * dz[a, lane]
 
 
 @compiled
-def _land(
-    size: tuple[int, int],
-    active: FloatArray,
-    u: FloatArray,
-    z: FloatArray,
-    gain: FloatArray,
-    dz: FloatArray,
-    answer: FloatArray,
-) -> None:
+def _land(eta: int, lanes: int, active: FloatArray, work: _Work) -> None:
     """After long steps, take eps from the impulse that Newton's method has arrived at: it isn't linear in it."""
-    for a in range(size[0]):
-        for lane in range(size[1]):
+    z, gain, dz, answer, u = work.z, work.gain, work.dz, work.answer, work.eps
+    for a in range(eta):
+        for lane in range(lanes):
             far = active[lane] * abs(dz[a, lane] * gain[a, lane]) > _LONG_STEP
             # e(z) flattens away from 0: an impulse that would cross it stops there first
             landing = eps_near_impulse(answer[a, lane]) if z[a, lane] * answer[a, lane] >= 0.0 else 0.0
@@ -162,10 +177,12 @@ def _land(
 
 @compiled
 def _start_anew(
-    members: tuple[int, int, int],
+    eta: int,
+    pair: int,
+    lanes: int,
     relay: FloatArray,
     scale: FloatArray,
-    work: FloatArray,
+    work: _Work,
     lack: FloatArray,
     stiffness: FloatArray,
 ) -> bool:
@@ -174,9 +191,8 @@ def _start_anew(
     Since M 1 = h, the equations of all observers add up to sum e + s sum h z = sum b. Where Newton's step for a common
     impulse would be long, every observer starts from the one common impulse that meets the sum.
     """
-    eta, pair, lanes = members
-    b, e, z, gain, u = work[0], work[1], work[2], work[3], work[7]
-    total = work[5]  # its first row is free for now
+    b, e, z, gain, u = work.b, work.e, work.z, work.gain, work.eps
+    total = work.pivot  # its first row is free for now
     links = 0.0
     for lane in range(lanes):
         lack[lane] = 0.0
@@ -208,12 +224,7 @@ def _start_anew(
 
 @compiled
 def solve(
-    plan: IntArray,
-    diagonal: FloatArray,
-    relay: FloatArray,
-    link_start: IntArray,
-    link: IntArray,
-    first: IntArray,
+    pairs: PairArrays,
     tau: float,
     predictor: FloatArray,
     source: FloatArray,
@@ -227,12 +238,7 @@ def solve(
     """One proximal step of the observers of a range of targets, in a range of environments.
 
     Args:
-        plan: and `diagonal`, `relay`, `link_start`, `link`, `first`: the arrays of a `PairLayout`.
-        diagonal: see there.
-        relay: see there.
-        link_start: see there.
-        link: see there.
-        first: see there.
+        pairs: `PairLayout.arrays`.
         tau: step of the implicit part, in seconds.
         predictor: (P, B) y*, the estimates after the explicit part of the step.
         source: (n, B) the fleet's vector that is observed (states x, or input maps g) at the end of the step.
@@ -242,26 +248,27 @@ def solve(
         estimate: (P, B) the new estimates, written; may be `predictor`.
         slope: (P, B) the correction -P^-1 J eps at the end of the step, written.
         batch: first environment and one past the last.
-        targets: first line of `plan` and one past the last.
+        targets: first target of the layout and one past the last.
 
     Returns:
-        Evaluations of the barrier (one per pair, component and Newton iteration), then the environment and the line of
-        `plan` where the solve failed, -1 and -1 if it didn't. It fails on input that isn't finite, and on nothing else
-        in three hundred thousand random problems up to a million funnel widths away (at most 27 iterations, 5 on
-        average; two along a run).
+        Evaluations of the barrier (one per pair, component and Newton iteration), then the environment and the target
+        (its place in the layout) where the solve failed, -1 and -1 if it didn't. It fails on input that isn't finite,
+        and on nothing else in three hundred thousand random problems up to a million funnel widths away (at most 27
+        iterations, 5 on average; two along a run).
     """
     widest = profile = most = 1
     for t in range(targets[0], targets[1]):
-        eta, n, pair = plan[t, 0], plan[t, 1], plan[t, 5]
+        eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
         entries = 0
         for a in range(eta):
-            entries += a - first[pair + a]
+            entries += a - pairs.first[pair + a]
         widest, profile = max(widest, eta), max(profile, entries)
         most = max(most, n * min(max(1, LANES // n), batch[1] - batch[0]))
-    work = np.empty((9, widest, most))
-    b, z, gain, dz, u, answer = work[0], work[2], work[3], work[4], work[7], work[8]
-    flat = work.reshape(9, widest * most)
-    flat_e, flat_z, flat_gain, flat_u = flat[1], flat[2], flat[3], flat[7]
+    shape = (widest, most)
+    b, e, z, gain, dz = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape)
+    pivot, entry, u, answer = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape)
+    work = _Work(b, e, z, gain, dz, pivot, entry, u, answer)
+    flat_e, flat_z, flat_gain, flat_u = e.reshape(-1), z.reshape(-1), gain.reshape(-1), u.reshape(-1)
     lower = np.empty((profile, most))
     row_start = np.empty(widest, np.int64)
     inv_rho, scale, active = np.empty(most), np.empty(most), np.empty(most)
@@ -269,11 +276,12 @@ def solve(
     evaluations = 0
 
     for t in range(targets[0], targets[1]):
-        eta, n, offset, origin, row, pair = plan[t, 0], plan[t, 1], plan[t, 2], plan[t, 3], plan[t, 4], plan[t, 5]
+        eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
+        offset, origin, row = pairs.column[t], pairs.source[t], pairs.row[t]
         entries = 0
         for a in range(eta):
-            row_start[a] = entries - first[pair + a]
-            entries += a - first[pair + a]
+            row_start[a] = entries - pairs.first[pair + a]
+            entries += a - pairs.first[pair + a]
         chunk = max(1, LANES // n)
         for c0 in range(batch[0], batch[1], chunk):
             width = min(chunk, batch[1] - c0)
@@ -292,11 +300,11 @@ def solve(
                         answer[a, place(c * width + env)] = predictor[column, place(c0 + env)]
                         u[a, place(c * width + env)] = eps[column, place(c0 + env)]
             for a in range(eta):
-                d, h = diagonal[pair + a], relay[pair + a]
+                d, h = pairs.diagonal[pair + a], pairs.relay[pair + a]
                 for lane in range(lanes):
                     b[a, lane] = d * answer[a, lane] - h * worst[lane]
-                for k in range(link_start[pair + a], link_start[pair + a + 1]):
-                    other = link[k]
+                for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
+                    other = pairs.entry[k]
                     for lane in range(lanes):
                         b[a, lane] -= answer[other, lane]
                 for lane in range(lanes):
@@ -308,9 +316,9 @@ def solve(
             moving = True
             while moving:
                 _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
-                if iteration == 0 and _start_anew((eta, pair, lanes), relay, scale, work, worst, poison):
+                if iteration == 0 and _start_anew(eta, pair, lanes, pairs.relay, scale, work, worst, poison):
                     _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
-                _newton_step((eta, pair, lanes), diagonal, link_start, link, first, scale, work, lower, row_start)
+                _newton_step(eta, pair, lanes, pairs, scale, work, lower, row_start)
                 evaluations += eta * lanes
                 iteration += 1
                 for lane in range(lanes):
@@ -333,7 +341,7 @@ def solve(
                     moving = moving or on
                     longest = max(longest, worst[lane])
                 if longest > _LONG_STEP:
-                    _land((eta, lanes), active, u, z, gain, dz, answer)
+                    _land(eta, lanes, active, work)
                 if moving and iteration == MAX_ITERATIONS:
                     for lane in range(lanes):
                         if active[lane] > 0.0:

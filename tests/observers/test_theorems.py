@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from strategies import OBSERVABLE_INPUT, PLANAR, SmoothSignals, System, definition_of_m, observers_of, systems
 
 from agents import TanhConsensus
-from khop_env.observers import Exponential, ObserverDesign, PairLayout, TargetObservers
+from khop_env.observers import Explicit, Exponential, ObserverDesign, PairLayout, Proximal, TargetObservers
 from khop_env.physics import DriftingIntegrator, Fleet
-from khop_env.simulation import Explicit, InitialSet, Proximal, Simulator
+from khop_env.simulation import InitialSet, Simulator
 
 BOTH = pytest.mark.parametrize("integrator", ["proximal", "explicit"])
 
@@ -28,12 +28,11 @@ class Bounds:
         graph, relay = system.design.communication, system.design.relay
         self.m = np.zeros((layout.size, layout.size))
         columns = []
-        for index, target in enumerate(layout.target.tolist()):
-            eta, n, offset, *_ = layout.plan[index].tolist()
-            m = definition_of_m(graph, observers_of(layout, index), target, relay)
-            self.m[offset : offset + eta * n, offset : offset + eta * n] = np.kron(m, np.eye(n))
-            gain = np.linalg.eigvalsh(m)[0] / np.sqrt(eta)
-            columns += eta * [(f.initial, f.final, f.rate, gain) for f in given_bounds[target]]
+        for index, block in enumerate(layout.blocks):
+            m = definition_of_m(graph, observers_of(layout, index), block.agent, relay)
+            self.m[block.columns, block.columns] = np.kron(m, np.eye(block.components))
+            gain = np.linalg.eigvalsh(m)[0] / np.sqrt(block.observers)
+            columns += block.observers * [(f.initial, f.final, f.rate, gain) for f in given_bounds[block.agent]]
         self.initial, self.final, self.rate, self.gain = np.array(columns).reshape(-1, 4).T
 
     def check(self, t: float, error: np.ndarray, difference: np.ndarray) -> None:
@@ -150,9 +149,9 @@ def test_what_a_simplification_leaves_out_is_left_out(which):
     fleet, one = Fleet([DriftingIntegrator()] * 3), Exponential(100.0, 100.0, 1.0)
     options = [TargetObservers(**{which: known}) for known in (True, True, False)]
     design = ObserverDesign(fleet, nx.path_graph(3), 2, one, one, targets=options)
-    simulator = Simulator(design, InitialSet(np.full(6, 0.7), np.zeros(6)), integrator=Explicit())
+    simulator = Simulator(design, InitialSet(np.full(6, 0.7), np.zeros(6)), observers=Explicit())
     state = simulator.save()
-    state.input_estimate[...] = 0.25
+    state.memory["input_estimate"][...] = 0.25
     simulator.restore(state)
     simulator.step(1e-6, np.full(6, 0.25))
     rates = (simulator.estimates - 0.7)[0].reshape(2, 2) / 1e-6

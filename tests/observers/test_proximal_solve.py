@@ -8,24 +8,23 @@ from hypothesis import strategies as st
 from strategies import SEEDS, connected_graphs, hops
 
 from khop_env.observers import PairLayout
-from khop_env.physics import k_hop_neighbors
-from khop_env.simulation.proximal import LANES, MAX_ITERATIONS, solve
+from khop_env.observers.solve import LANES, MAX_ITERATIONS, solve
+from khop_env.physics import Links, k_hop_neighbors
 
 
 def layout_of(graph, k, relay, dimensions=None):
     """A layout over all agents, of one component each by default."""
     dimensions = dimensions or [1] * len(graph)
     offsets = np.concatenate([[0], np.cumsum(dimensions)])
-    return PairLayout.build(graph, k_hop_neighbors(graph, k, relay=relay), dimensions, offsets, relay=relay)
+    return PairLayout.build(Links.of(graph), k_hop_neighbors(graph, k, relay=relay), dimensions, offsets, relay=relay)
 
 
 def run(layout, tau, predictor, source, rho, eps=None, batch=None, targets=None):
     """`solve` on copies: the estimates, eps, slope and what it returned."""
     eps = np.zeros_like(predictor) if eps is None else eps.copy()
     estimate, slope = np.full_like(predictor, np.nan), np.full_like(predictor, np.nan)
-    arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
     result = solve(
-        *arrays,
+        layout.arrays,
         tau,
         predictor,
         source,
@@ -34,7 +33,7 @@ def run(layout, tau, predictor, source, rho, eps=None, batch=None, targets=None)
         estimate,
         slope,
         batch or (0, predictor.shape[1]),
-        targets or (0, len(layout.plan)),
+        targets or (0, len(layout.blocks)),
     )
     return estimate, eps, slope, result
 
@@ -52,10 +51,10 @@ def problem(layout, rng, batch=1, hard=True):
 def full_matrix(layout):
     """M of all targets and components at once, and how much of the truth each estimate is told."""
     m, h = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
-    for index, (eta, n, offset, _, _, pair) in enumerate(layout.plan.tolist()):
-        part = slice(offset, offset + eta * n)
+    for index, block in enumerate(layout.blocks):
+        part, n = block.columns, block.components
         m[part, part] = np.kron(layout.matrix(index), np.eye(n))
-        h[part] = np.repeat(layout.relay[pair : pair + eta], n)
+        h[part] = np.repeat(layout.arrays.relay[block.pairs], n)
     return m, h
 
 
@@ -90,13 +89,14 @@ def test_stress_one_component_converges_from_anywhere(graph, about, seed):
     rng = np.random.default_rng(seed)
     for _ in range(5):
         tau, predictor, source, rho = problem(layout, rng)
-        for index, (eta, _, offset, *_) in enumerate(layout.plan.tolist()):
+        for index, block in enumerate(layout.blocks):
+            eta = block.observers
             alone = run(layout, tau, predictor, source, rho, targets=(index, index + 1))
             evaluations, env, line = alone[3]
             assert (env, line) == (-1, -1)
             assert evaluations % eta == 0
             assert evaluations // eta <= MAX_ITERATIONS // 2
-            assert np.all(np.isfinite(alone[0][offset : offset + eta]))
+            assert np.all(np.isfinite(alone[0][block.columns]))
         estimate, eps, slope, _ = run(layout, tau, predictor, source, rho)
         check_solution(layout, tau, predictor, source, rho, estimate, eps, slope)
 
@@ -151,12 +151,11 @@ def test_every_environment_and_target_is_solved_as_if_alone(graph, about, dimens
         for ours, alone in zip(whole[:3], run(layout, tau, *one)[:3], strict=True):
             np.testing.assert_array_equal(ours[:, b], alone[:, 0])
 
-    cut, line = int(rng.integers(0, batch + 1)), int(rng.integers(0, len(layout.plan) + 1))
+    cut, line = int(rng.integers(0, batch + 1)), int(rng.integers(0, len(layout.blocks) + 1))
     joined = [start.copy(), np.full_like(predictor, np.nan), np.full_like(predictor, np.nan)]
-    arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
     for environments in ((0, cut), (cut, batch)):
-        for targets in ((0, line), (line, len(layout.plan))):
-            solve(*arrays, tau, predictor, source, rho, *joined, environments, targets)
+        for targets in ((0, line), (line, len(layout.blocks))):
+            solve(layout.arrays, tau, predictor, source, rho, *joined, environments, targets)
     for ours, split in zip(whole[:3], (joined[1], joined[0], joined[2]), strict=True):
         np.testing.assert_array_equal(ours, split)
 
@@ -168,8 +167,7 @@ def test_the_predictor_may_be_overwritten(graph, about, seed):
     tau, predictor, source, rho = problem(layout, np.random.default_rng(seed), 3, hard=False)
     expected = run(layout, tau, predictor, source, rho)
     eps, slope, estimate = np.zeros_like(predictor), np.empty_like(predictor), predictor.copy()
-    arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
-    solve(*arrays, tau, estimate, source, rho, eps, estimate, slope, (0, 3), (0, len(layout.plan)))
+    solve(layout.arrays, tau, estimate, source, rho, eps, estimate, slope, (0, 3), (0, len(layout.blocks)))
     np.testing.assert_array_equal(estimate, expected[0])
     np.testing.assert_array_equal(eps, expected[1])
 
@@ -203,7 +201,8 @@ def test_numbers_that_are_not_finite_are_reported_not_looped_over(which, relay, 
     tau, predictor, source, rho = problem(layout, np.random.default_rng(0), batch, hard=False)
     data = {"predictor": predictor, "source": source, "rho": rho, "eps": np.zeros_like(predictor)}
     target = 2 if relay else 0
-    index = int(layout.plan[target, 3 if which == "source" else 2])
+    block = layout.blocks[target]
+    index = (block.sources if which == "source" else block.columns).start
     data[which][index, batch - 1] = bad
     evaluations, env, line = run(layout, tau, **data)[3]
     assert (env, line) == (batch - 1, target)

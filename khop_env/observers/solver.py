@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from khop_env.observers import FloatArray, PairLayout
-from khop_env.simulation import proximal
+from khop_env.observers.layout import FloatArray, PairLayout
+from khop_env.observers.solve import LANES, solve
 
 
 class Solver:
@@ -17,17 +17,17 @@ class Solver:
 
     Args:
         layout: who estimates whom.
-        batch: number of environments.
+        num_envs: number of environments.
         threads: how many threads share the work; results don't depend on it.
     """
 
-    def __init__(self, layout: PairLayout, batch: int, threads: int) -> None:
-        self._arrays = (layout.plan, layout.diagonal, layout.relay, layout.link_start, layout.link, layout.first)
-        targets = len(layout.plan)
-        by_environment = batch >= threads * proximal.LANES
-        cuts = np.linspace(0, batch if by_environment else targets, threads + 1).astype(int).tolist()
+    def __init__(self, layout: PairLayout, num_envs: int, threads: int) -> None:
+        self._pairs = layout.arrays
+        targets = len(layout.target)
+        by_environment = num_envs >= threads * LANES
+        cuts = np.linspace(0, num_envs if by_environment else targets, threads + 1).astype(int).tolist()
         parts = list(itertools.pairwise(cuts))
-        self._ranges = [(part, (0, targets)) if by_environment else ((0, batch), part) for part in parts]
+        self._ranges = [(part, (0, targets)) if by_environment else ((0, num_envs), part) for part in parts]
         self._pool: tuple[int, ThreadPoolExecutor] | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -36,13 +36,11 @@ class Solver:
     def __call__(
         self, tau: float, y: FloatArray, source: FloatArray, rho: FloatArray, eps: FloatArray, slope: FloatArray
     ) -> list[tuple[int, int, int]]:
-        """`proximal.solve` from the predictor `y`, which the estimates overwrite; what it returns, range by range."""
+        """`solve` from the predictor `y`, which the estimates overwrite; what it returns, range by range."""
         if len(self._ranges) == 1:
-            return [proximal.solve(*self._arrays, tau, y, source, rho, eps, y, slope, *self._ranges[0])]
+            return [solve(self._pairs, tau, y, source, rho, eps, y, slope, *self._ranges[0])]
         if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads
             self._pool = (os.getpid(), ThreadPoolExecutor(len(self._ranges)))
         return list(
-            self._pool[1].map(
-                lambda part: proximal.solve(*self._arrays, tau, y, source, rho, eps, y, slope, *part), self._ranges
-            )
+            self._pool[1].map(lambda part: solve(self._pairs, tau, y, source, rho, eps, y, slope, *part), self._ranges)
         )

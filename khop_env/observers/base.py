@@ -1,0 +1,252 @@
+"""Observers as objects that own their memory: what every realisation has in common.
+
+A simulator's state is the plant's part and one dictionary of arrays, the observers' memory. The plant moves under its
+law and disturbance; the observers say when, because the paper's continuous-time observers are integrated together with
+it, stage by stage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from khop_env.observers.design import ObserverDesign
+from khop_env.observers.disagreement import largest_ratios
+from khop_env.observers.layout import FloatArray, IntArray
+from khop_env.observers.performance import FunnelBank
+from khop_env.physics import Fleet
+
+Memory = dict[str, FloatArray]
+"""Memory of observers by name, batch last; "estimate" (P, B) and "input_estimate" (Q, B) always."""
+
+Basis = Literal["theorem", "construction"]
+
+
+class SolveError(RuntimeError):
+    """A step met numbers that aren't finite, in a state, an input, a disturbance or an estimate."""
+
+
+class PlantState(Protocol):
+    """Arrays of B environments, batch last: the plant's part of a simulator's state, and the observers' memory.
+
+    Attributes:
+        t: (B,) time since reset in s.
+        x: (n, B) true states.
+        u: (m, B) inputs in force.
+        g: (n, B) their effect g_i(x_i, u_i).
+        drawn: (B, K) the disturbance's random numbers of this episode.
+        memory: of the observers.
+    """
+
+    t: FloatArray
+    x: FloatArray
+    u: FloatArray
+    g: FloatArray
+    drawn: FloatArray
+    memory: Memory
+
+
+class Plant(Protocol):
+    """The plant under its law and disturbance, as observers advance it.
+
+    Attributes:
+        fleet: the agents.
+    """
+
+    fleet: Fleet
+
+    def stage(self, number: int, weights: FloatArray, elapsed: float, before: PlantState, state: PlantState) -> None:
+        """Move `state.t` and `state.x` to a Runge-Kutta stage.
+
+        Args:
+            number: of the stage, from 0; the rate of change at `state` becomes that of this number.
+            weights: (number + 1,) of the rates so far, in s.
+            elapsed: time of the stage after `before.t`, in s.
+            before: the state at the beginning of the step.
+            state: the stage before on entry, this one on return; its inputs are still those of the stage before.
+
+        Raises:
+            SolveError: if a state isn't finite.
+        """
+        ...
+
+    def actuate(self, state: PlantState) -> None:
+        """Write the law's inputs at t, x and the estimates into `state.u`, and their effect into `state.g`."""
+        ...
+
+
+class Certified(NamedTuple):
+    """A guaranteed bound on the error of every estimate.
+
+    Attributes:
+        bound: (P, B) in the units of the estimates.
+        basis: what it rests on: a "theorem" of the paper, in continuous time; or the "construction" of the step, at
+            every grid point.
+    """
+
+    bound: FloatArray
+    basis: Basis
+
+
+class Observers(Protocol):
+    """A realisation of the observers.
+
+    Attributes:
+        name: e.g. "proximal".
+        order: of convergence in the step.
+    """
+
+    name: str
+    order: int
+
+    def prepare(self, design: ObserverDesign, num_envs: int) -> None:
+        """Get ready; called once, before everything else.
+
+        Args:
+            design: who estimates whom, and within which funnels.
+            num_envs: number of environments B.
+        """
+        ...
+
+    def allocate(self) -> Memory:
+        """Zeroed memory of B environments; "estimate" and "input_estimate" are in it."""
+        ...
+
+    def reset(
+        self, memory: Memory, env_ids: IntArray, rngs: Sequence[np.random.Generator], first_guess: FloatArray
+    ) -> None:
+        """Start anew in some environments.
+
+        Args:
+            memory: of all environments; the others keep every bit.
+            env_ids: (R,) their indices.
+            rngs: (R,) generators, for realisations that draw random numbers; whatever they draw from these themselves
+                changes what is drawn after them, so take `rng.spawn(1)`.
+            first_guess: (n,) from which all estimates start.
+        """
+        ...
+
+    def advance(self, plant: Plant, before: PlantState, state: PlantState, dt: float) -> None:
+        """Advance plant and estimates by `dt` seconds.
+
+        Args:
+            plant: moves the true states.
+            before: the state at the beginning of the step; only read.
+            state: a copy of it on entry, the state at the end of the step on return. Where this raises it is undefined.
+            dt: in s.
+
+        Raises:
+            SolveError: if a number isn't finite.
+        """
+        ...
+
+    def bound(self, state: PlantState, out: FloatArray) -> Certified:
+        """The guaranteed bound on the error of each of a state's estimates, written into `out` (P, B)."""
+        ...
+
+    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+        """Raise running maxima to the ratios of a state."""
+        ...
+
+
+class Extremes(NamedTuple):
+    """The largest ratios since reset or `restart_extremes`, one per environment: below 1 the guarantee holds.
+
+    Attributes:
+        normalized: (B,) largest |xi| / rho over pairs, components and steps.
+        relative: (B,) largest |x_tilde| / delta.
+        input_normalized: (B,) largest |mu| / omega.
+        input_relative: (B,) largest |g_tilde| / theta.
+    """
+
+    normalized: FloatArray
+    relative: FloatArray
+    input_normalized: FloatArray
+    input_relative: FloatArray
+
+    def kept(self) -> FloatArray:
+        """(B,) the larger of the two ratios of disagreements: below 1 while everyone is inside every funnel."""
+        return np.maximum(self.normalized, self.input_normalized)
+
+    def copied(self) -> Extremes:
+        """An independent copy."""
+        return Extremes(*(values.copy() for values in self))
+
+
+class WidthsNow:
+    """The widths of many funnels at the time of a simulation, evaluated once an instant.
+
+    Args:
+        bank: the funnels.
+        num_envs: number of environments B.
+    """
+
+    def __init__(self, bank: FunnelBank, num_envs: int) -> None:
+        self._bank = bank
+        self._time = np.full(num_envs, np.nan)
+        self._values = np.ones((len(bank), num_envs))
+
+    def at(self, t: FloatArray) -> FloatArray:
+        """(rows, B) widths at the times `t` (B,); overwritten by the next instant's."""
+        if not np.array_equal(t, self._time):
+            self._time.fill(np.nan)  # whatever the evaluation raises, half of it isn't taken for the whole
+            self._bank.evaluate(t, self._values)
+            self._time[...] = t
+        return self._values
+
+
+class FunnelObservers:
+    """The paper's state and input observers (PPSO and PPIO), however they are stepped.
+
+    Attributes:
+        design: who estimates whom, and within which funnels.
+        num_envs: number of environments B.
+        rho: the state observers' funnels now.
+        omega: the input observers'.
+    """
+
+    basis: Basis = "theorem"
+
+    def prepare(self, design: ObserverDesign, num_envs: int) -> None:
+        """Allocate what steps of `design` need in `num_envs` environments."""
+        self.design, self.num_envs = design, num_envs
+        self.rho, self.omega = WidthsNow(design.states.rho, num_envs), WidthsNow(design.inputs.rho, num_envs)
+        self._error_bound = WidthsNow(design.states.error_bounds, num_envs)
+
+    def allocate(self) -> Memory:
+        """Estimates of states (P, B) and of the inputs' effects (Q, B)."""
+        sizes = {"estimate": self.design.states.layout.size, "input_estimate": self.design.inputs.layout.size}
+        return {name: np.zeros((size, self.num_envs)) for name, size in sizes.items()}
+
+    def reset(
+        self, memory: Memory, env_ids: IntArray, rngs: Sequence[np.random.Generator], first_guess: FloatArray
+    ) -> None:
+        """Start the estimates in `memory` from `first_guess` in the environments `env_ids`; `rngs` aren't used."""
+        for name, values in memory.items():
+            guess = first_guess[self.design.states.layout.column_source][:, None] if name == "estimate" else 0.0
+            values[:, env_ids] = guess
+
+    def bound(self, state: PlantState, out: FloatArray) -> Certified:
+        """Delta: what the design rule guarantees as long as every disagreement is inside its funnel (Problem 2)."""
+        out[...] = self._error_bound.at(state.t)
+        return Certified(out, self.basis)
+
+    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+        """Raise running maxima of |xi| / rho and |x_tilde| / delta, and of the same for inputs, to those of a state."""
+        memory = state.memory
+        for funnels, widths, estimate, source, normalized, relative in (
+            (self.design.states, self.rho, memory["estimate"], state.x, extremes.normalized, extremes.relative),
+            (
+                self.design.inputs,
+                self.omega,
+                memory["input_estimate"],
+                state.g,
+                extremes.input_normalized,
+                extremes.input_relative,
+            ),
+        ):
+            if funnels.layout.size:
+                rho = widths.at(state.t)
+                largest_ratios(funnels.layout.arrays, estimate, source, rho, funnels.gain, normalized, relative)

@@ -1,0 +1,75 @@
+"""The non-stiff part of the state observers: what they predict from the models, f_i(x_hat) + g_hat."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from khop_env.observers.design import ObserverDesign
+from khop_env.observers.layout import FloatArray
+from khop_env.physics import AgentModel
+
+
+class _DriftRun(NamedTuple):
+    """Consecutive targets with equal models whose observers know f_i."""
+
+    model: AgentModel
+    columns: slice
+    pairs: int
+
+
+class Prediction:
+    """f_i(x_hat) + g_hat of all state observers.
+
+    Args:
+        design: which observers know f_i, and which have an input observer beside them.
+        num_envs: number of environments B.
+    """
+
+    def __init__(self, design: ObserverDesign, num_envs: int) -> None:
+        self._num_envs = num_envs
+        self._drifts = _drift_runs(design)
+        self._inputs = _shared_columns(design)
+        predicted = sum(run.columns.stop - run.columns.start for run in self._drifts)
+        self._all_drifts_known = predicted == design.states.layout.size
+
+    def rate(self, t: FloatArray, estimate: FloatArray, input_estimate: FloatArray, out: FloatArray) -> None:
+        """Write f_i(x_hat) + g_hat into `out` (P, B), at times (B,), estimates (P, B) and input estimates (Q, B)."""
+        if not self._all_drifts_known:
+            out.fill(0.0)
+        times = t[:, None]
+        for model, columns, pairs in self._drifts:
+            rates = model.drift(times, estimate[columns].T.reshape(self._num_envs, pairs, model.n))
+            out[columns] = rates.reshape(self._num_envs, -1).T
+        for state_columns, input_columns in self._inputs:
+            out[state_columns] += input_estimate[input_columns]
+
+
+def _drift_runs(design: ObserverDesign) -> list[_DriftRun]:
+    """The targets whose observers know f_i, in as few runs as possible."""
+    models = design.fleet.models
+    runs: list[_DriftRun] = []
+    for block in design.states.layout.blocks:
+        if not design.options[block.agent].drift:
+            continue
+        model, columns, pairs = models[block.agent], block.columns, block.observers
+        if runs and runs[-1].columns.stop == columns.start and (runs[-1].model is model or runs[-1].model == model):
+            last = runs.pop()
+            model, columns, pairs = last.model, slice(last.columns.start, columns.stop), last.pairs + pairs
+        runs.append(_DriftRun(model, columns, pairs))
+    return runs
+
+
+def _shared_columns(design: ObserverDesign) -> list[tuple[slice, slice]]:
+    """Columns of the state estimates and of the input estimates of the same pairs, in as few runs as possible.
+
+    Both layouts list targets ascending and a target's observers in the same order.
+    """
+    of_states = {block.agent: block.columns for block in design.states.layout.blocks}
+    runs: list[tuple[slice, slice]] = []
+    for block in design.inputs.layout.blocks:
+        states, inputs = of_states[block.agent], block.columns
+        if runs and runs[-1][0].stop == states.start and runs[-1][1].stop == inputs.start:
+            last_states, last_inputs = runs.pop()
+            states, inputs = slice(last_states.start, states.stop), slice(last_inputs.start, inputs.stop)
+        runs.append((states, inputs))
+    return runs

@@ -1,0 +1,145 @@
+"""The paper's observers by a coupled proximal step: implicit-explicit Runge-Kutta, inside the funnels at any step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from khop_env.elementary import weighted_sum
+from khop_env.observers.base import FunnelObservers, Memory, Plant, PlantState, SolveError
+from khop_env.observers.design import Funnels, ObserverDesign
+from khop_env.observers.layout import FloatArray
+from khop_env.observers.prediction import Prediction
+from khop_env.observers.solve import MAX_ITERATIONS
+from khop_env.observers.solver import Solver
+
+
+@dataclass(frozen=True)
+class Tableau:
+    """An implicit-explicit Runge-Kutta pair: row s holds the weights of the stages before s (and, implicit, of s)."""
+
+    nodes: tuple[float, ...]
+    explicit: tuple[tuple[float, ...], ...]
+    implicit: tuple[tuple[float, ...], ...]
+
+
+_GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
+_DELTA = 1.0 - 1.0 / (2.0 * _GAMMA)
+# ARS(1,1,1) and ARS(2,2,2): U. M. Ascher, S. J. Ruuth, R. J. Spiteri, Implicit-explicit Runge-Kutta methods for
+# time-dependent partial differential equations, 1997. Stiffly accurate: a step's result is its last stage, which is a
+# proximal step itself, so the funnel is kept at every grid point and in every stage.
+TABLEAUS = {
+    1: Tableau(nodes=(1.0,), explicit=((1.0,),), implicit=((1.0,),)),
+    2: Tableau(
+        nodes=(_GAMMA, 1.0),
+        explicit=((_GAMMA,), (_DELTA, 1.0 - _DELTA)),
+        implicit=((_GAMMA,), (1.0 - _GAMMA, _GAMMA)),
+    ),
+}
+
+
+class Proximal(FunnelObservers):
+    """The barrier implicit, everything else explicit: |e| < 1 at every grid point, whatever the step.
+
+    Its memory adds "eps" (P, B) and "nu" (Q, B): the transformed disagreements, from which the next solve starts.
+
+    Args:
+        order: 1 or 2.
+        threads: environments (or targets, in a small batch) are solved by this many threads; results don't depend on
+            it.
+
+    Attributes:
+        evaluations: of the barrier, in all steps so far.
+
+    Raises:
+        ValueError: if there is no such order, or threads is below 1.
+    """
+
+    name = "proximal"
+    basis = "construction"
+
+    def __init__(self, order: int = 2, threads: int = 1) -> None:
+        if order not in TABLEAUS:
+            raise ValueError(f"the proximal step exists at order 1 and 2; got order={order!r}")
+        if threads < 1:
+            raise ValueError(f"threads must be at least 1; got {threads!r}")
+        self.order, self.threads = order, threads
+        self.evaluations = 0
+        self._tableau = TABLEAUS[order]
+        self._explicit = [np.array(row) for row in self._tableau.explicit]
+        self._implicit = [np.array(row) for row in self._tableau.implicit]
+
+    def prepare(self, design: ObserverDesign, num_envs: int) -> None:
+        """Allocate what steps of `design` need in `num_envs` environments."""
+        super().prepare(design, num_envs)
+        stages = range(len(self._tableau.nodes))
+        pairs, input_pairs = design.states.layout.size, design.inputs.layout.size
+        self._prediction = Prediction(design, num_envs)
+        self._rates = tuple(np.zeros((pairs, num_envs)) for _ in stages)
+        self._slopes = tuple(np.zeros((pairs, num_envs)) for _ in stages)
+        self._input_slopes = tuple(np.zeros((input_pairs, num_envs)) for _ in stages)
+        self._solve_states = Solver(design.states.layout, num_envs, self.threads)
+        self._solve_inputs = Solver(design.inputs.layout, num_envs, self.threads)
+
+    def allocate(self) -> Memory:
+        """Estimates and warm starts."""
+        memory = super().allocate()
+        return {**memory, "eps": np.zeros_like(memory["estimate"]), "nu": np.zeros_like(memory["input_estimate"])}
+
+    def advance(self, plant: Plant, before: PlantState, state: PlantState, dt: float) -> None:
+        """Advance `state`, a copy of `before`, by `dt` seconds, moving the `plant` with it.
+
+        Raises:
+            SolveError: if a state, input, disturbance or estimate isn't finite.
+        """
+        memory, last = state.memory, before.memory
+        estimate, input_estimate = memory["estimate"], memory["input_estimate"]
+        for s, node in enumerate(self._tableau.nodes):
+            # rates at the stage before: the state holds that stage's values, at its time
+            self._prediction.rate(state.t, estimate, input_estimate, self._rates[s])
+            explicit, implicit = self._explicit[s] * dt, self._implicit[s] * dt
+            tau = float(implicit[s])
+            plant.stage(s, explicit, node * dt, before, state)
+            weighted_sum(last["estimate"], explicit, self._rates[: s + 1], estimate)
+            if s:
+                weighted_sum(estimate, implicit[:s], self._slopes[:s], estimate)
+            rho = self.rho.at(state.t)
+            found = self._solve_states(tau, estimate, state.x, rho, memory["eps"], self._slopes[s])
+            self._account(found, self.design.states, state.x, rho)
+            plant.actuate(state)
+            if self.design.inputs.layout.size:
+                if s:
+                    weighted_sum(last["input_estimate"], implicit[:s], self._input_slopes[:s], input_estimate)
+                omega = self.omega.at(state.t)
+                found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], self._input_slopes[s])
+                self._account(found, self.design.inputs, state.g, omega)
+
+    def _account(
+        self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray
+    ) -> None:
+        """Count the work of a solve, and say why it failed if it did."""
+        for evaluations, env, target in found:
+            self.evaluations += evaluations
+            if env >= 0:
+                raise SolveError(self._failure(funnels, target, env, source, rho))
+
+    def _failure(self, funnels: Funnels, target: int, env: int, source: FloatArray, rho: FloatArray) -> str:
+        fleet, block = self.design.fleet, funnels.layout.blocks[target]
+        observers = f"environment {env}, observers of {fleet.ids[block.agent]!r}: "
+        kind = "state" if funnels is self.design.states else "input map"
+        for c in range(block.components):
+            value, width = source[block.sources.start + c, env], rho[block.rows.start + c, env]
+            name = fleet.component_names()[block.sources.start + c][1]
+            if not np.isfinite(value):
+                return (
+                    f"{observers}its {kind} became {value} in component {name!r}; check the agent model, the law and "
+                    "the disturbance, or take a shorter step if the plant itself diverged"
+                )
+            if not (np.isfinite(width) and width > 0.0):
+                return f"{observers}the funnel of component {name!r} became {width}; it has to be positive and finite"
+        return (
+            f"{observers}the estimates became non-finite, or the solve didn't converge in {MAX_ITERATIONS} "
+            "iterations; check the agent model's drift at the estimates, and please report the latter"
+        )

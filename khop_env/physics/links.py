@@ -1,0 +1,55 @@
+"""Directed communication links: who may receive messages from whom."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """The directed links of a communication graph, numbered: sender -> receiver.
+
+    An undirected edge is two links. Layouts are built once over all links that may ever be up; which of them are up,
+    and how old is what came over them, is data of an episode (`simulation.LinkState`).
+
+    Attributes:
+        agents: number of agents N.
+        sender: (L,) sending agents.
+        receiver: (L,) receiving agents; links are ordered by receiver, then by sender.
+    """
+
+    agents: int
+    sender: NDArray[np.int64]
+    receiver: NDArray[np.int64]
+
+    @staticmethod
+    def of(graph: nx.Graph) -> Links:
+        """The links of a graph on the nodes 0..N-1; both directions of each edge if it is undirected."""
+        edges = set(graph.edges)
+        if not graph.is_directed():
+            edges |= {(j, i) for i, j in edges}
+        ordered = np.array(sorted((receiver, sender) for sender, receiver in edges), np.int64).reshape(-1, 2)
+        return Links(graph.number_of_nodes(), np.ascontiguousarray(ordered[:, 1]), np.ascontiguousarray(ordered[:, 0]))
+
+    def __len__(self) -> int:
+        """Number of links L."""
+        return len(self.sender)
+
+    @cached_property
+    def index(self) -> dict[tuple[int, int], int]:
+        """(sender, receiver) -> number of the link."""
+        pairs = zip(self.sender.tolist(), self.receiver.tolist(), strict=True)
+        return {pair: number for number, pair in enumerate(pairs)}
+
+    @cached_property
+    def senders(self) -> tuple[frozenset[int], ...]:
+        """Per agent its in-neighbours: the agents that it receives from."""
+        found: list[set[int]] = [set() for _ in range(self.agents)]
+        for sender, receiver in self.index:
+            found[receiver].add(sender)
+        return tuple(frozenset(each) for each in found)

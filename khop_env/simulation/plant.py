@@ -1,0 +1,91 @@
+"""The plant under its law and disturbance, and its one stepper: what `observers.Plant` asks for.
+
+Arrays are (columns, B) here, batch last and contiguous, because compiled loops run along the batch. What models, laws,
+disturbances and users get are views (B, ...) of them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from khop_env.elementary import weighted_sum
+from khop_env.observers import FloatArray, PlantState, SolveError
+from khop_env.physics import Fleet
+from khop_env.simulation.view import Law, ViewBuilder
+
+
+class FleetPlant:
+    """x' = f(x) + g(x, u) + w(x, t) for a whole fleet, with u from a law or held.
+
+    Args:
+        fleet: the agents.
+        num_envs: number of environments B.
+        disturbance: an attached disturbance (`physics.Disturbance.attach`), or None.
+        law: the feedback law, or None for inputs that are held.
+        views: what the law sees; needed with a law.
+    """
+
+    def __init__(
+        self, fleet: Fleet, num_envs: int, disturbance: Any | None, law: Law | None, views: ViewBuilder | None
+    ) -> None:
+        self.fleet, self.num_envs = fleet, num_envs
+        self.disturbance, self.law, self.views = disturbance, law, views
+        self._rates: tuple[FloatArray, ...] = ()
+        self._w = np.zeros((fleet.n, num_envs)).T  # (B, n) in the memory order of the states
+
+    def rate(self, state: PlantState, out: FloatArray) -> None:
+        """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
+        states = state.x.T
+        self.fleet.drift(state.t, states, out.T)
+        out += state.g
+        if self.disturbance is not None:
+            out += self.disturbance(state.t, states, state.drawn, self._w).T
+
+    def stage(self, number: int, weights: FloatArray, elapsed: float, before: PlantState, state: PlantState) -> None:
+        """Move `state` to stage `number`: `before` plus the rates so far times `weights`, `elapsed` seconds later.
+
+        Raises:
+            SolveError: if a state isn't finite.
+        """
+        if len(self._rates) <= number:
+            self._rates = (*self._rates, np.zeros((self.fleet.n, self.num_envs)))
+        self.rate(state, self._rates[number])
+        np.add(before.t, elapsed, out=state.t)
+        weighted_sum(before.x, weights, self._rates[: number + 1], state.x)
+        require_finite(state.x, self.fleet)
+
+    def actuate(self, state: PlantState) -> None:
+        """Write the law's inputs into `state.u` (m, B), without a law leave the held ones there; then g(x, u).
+
+        Raises:
+            ValueError: if the law returns inputs of a wrong shape.
+        """
+        if self.law is not None:
+            assert self.views is not None
+            u = self.law(state.t, self.views.update(state.x, state.memory["estimate"]))
+            if np.shape(u) != (self.num_envs, self.fleet.m):
+                raise ValueError(
+                    f"law {self.law!r} returned inputs of shape {np.shape(u)}; expected (environments, inputs) = "
+                    f"{(self.num_envs, self.fleet.m)}"
+                )
+            state.u.T[:] = u
+        self.fleet.input_map(state.t, state.x.T, state.u.T, state.g.T)
+
+
+def require_finite(x: FloatArray, fleet: Fleet) -> None:
+    """Refuse states (n, B) that became NaN or infinite, also those of agents that nobody estimates.
+
+    Raises:
+        SolveError: naming the environment, agent and component.
+    """
+    if math.isfinite(x.sum()):
+        return
+    for column, env in np.argwhere(~np.isfinite(x)).tolist():
+        agent, name, _ = fleet.component_names()[column]
+        raise SolveError(
+            f"environment {env}: state {name!r} of {agent!r} became {x[column, env]}; check its agent model, the law "
+            "and the disturbance, or take a shorter step if the plant itself diverged"
+        )
