@@ -25,7 +25,8 @@ def bench(
 ) -> None:
     """Measure speed and memory against explicit, SciPy's and bare loops, and other libraries' environments.
 
-    It runs in a clone of the repository. Ctrl-C ends it and prints what was measured.
+    It runs in a clone of the repository. Exit status 2 if a part failed, and 130 after Ctrl-C; what was measured is
+    printed all the same.
     """
     with mistakes():
         result = _benchmark()(quick=quick, progress=say, peers=peers)
