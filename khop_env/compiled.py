@@ -1,23 +1,31 @@
 """How this package compiles: one decorator, so that all kernels agree on caching, errors and the GIL.
 
-Numba's own cache watches the file of a kernel, not the functions that are pasted into it from other files, and gives
-up where no folder can be written. The cache here is keyed by the text of all kernels, and goes without a folder.
+Numba's own cache watches the file of a kernel, not the functions that are pasted into it from other files; a file that
+a crash cut off ends every later run; and on a full disk the call fails. So Numba chooses the folder, and the classes
+below read and write.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import pickle
+import re
 import sys
+import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+# What stands in files whose text kernels depend on; compiled code knows the fields of a named tuple by position only.
+_MARKS = (b"@compiled", b"@inlined", b"NamedTuple")
+_DIGEST = hashlib.sha256().digest_size
 
 
 def compiled(function: F) -> F:
@@ -25,72 +33,142 @@ def compiled(function: F) -> F:
 
     Fast-math stays off: a result may not depend on how many environments share a vector register. Threads are
     Python's own, over ranges of the batch; Numba's pools survive neither forking nor two callers at once.
+
+    Cached code is used while the text of this package's kernels and of the function's own file stays the same. A
+    constant or a kernel that the function takes from yet another file isn't watched.
     """
-    return _cached(numba.njit(nogil=True, error_model="numpy")(function), function)
+    return _cached(function)
 
 
 def inlined(function: F) -> F:
     """Like `compiled`, but pasted into its compiled callers, so that their loops still vectorise."""
-    return _cached(numba.njit(nogil=True, error_model="numpy", inline="always")(function), function)
+    return _cached(function, inline="always")
 
 
-def _cached(dispatcher: Any, function: F) -> F:
+def _cached(function: F, **options: str) -> F:
+    compile_with = functools.partial(numba.njit, nogil=True, error_model="numpy", **options)
     try:
-        dispatcher._cache = _KernelCache(function)
-    except RuntimeError:  # Numba: no folder can be written
-        dispatcher._cache = _NoCache()
+        dispatcher: Any = compile_with(cache=True)(function)
+        dispatcher._cache = _Cache(function, dispatcher._cache)
+    except (RuntimeError, OSError, AttributeError):  # no folder, no file, or a Numba that has other names for these
+        dispatcher = compile_with()(function)
+        if hasattr(dispatcher, "_cache"):
+            dispatcher._cache = _Cache(function, None)
     return dispatcher
 
 
 @functools.cache
-def _fingerprint() -> str:
-    """The text of all files with kernels, in short."""
+def _text_of_kernels() -> bytes:
+    """Digest of all files of this package that kernels depend on."""
     root = Path(__file__).parent
     digest = hashlib.sha256()
     for path in sorted([*root.rglob("*.py"), *(root.parent / "agents").rglob("*.py")]):
         text = path.read_bytes()
-        if b"@compiled" in text or b"@inlined" in text:
+        if any(mark in text for mark in _MARKS):
             digest.update(text)
-    return digest.hexdigest()
+    return digest.digest()
+
+
+@functools.cache
+def _text_of(path: str) -> bytes:
+    return hashlib.sha256(Path(path).read_bytes()).digest()
 
 
 @functools.cache
 def _announce(kept: bool) -> None:
-    where = "the result is kept for later runs" if kept else "no cache folder can be written, so every process does it"
-    print(f"khop_env: compiling for this machine, about ten seconds in all ({where}) ...", file=sys.stderr, flush=True)
+    where = "the result is kept for later runs" if kept else "no folder can be written, so every process does it"
+    _say(f"compiling for this machine, about ten seconds in all ({where}) ...")
 
 
-class _KernelFile(IndexDataCacheFile):
-    """Names a data file after what is in it: two processes that save at once may lose an entry but can't swap two."""
-
-    def save(self, key: Any, data: Any) -> None:
-        overloads = self._load_index()
-        overloads[key] = self._data_name(int(hashlib.sha256(repr(key).encode()).hexdigest()[:12], 16))
-        self._save_data(overloads[key], data)
-        self._save_index(overloads)
+@functools.cache
+def _say(text: str) -> None:
+    print(f"khop_env: {text}", file=sys.stderr, flush=True)
 
 
-class _KernelCache(FunctionCache):
-    def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)
-        self._cache_file = _KernelFile(self._cache_path, self._impl.filename_base, _fingerprint())
+class _Cache:
+    """What a dispatcher of Numba asks for compiled code, and gives it to. Nothing that goes wrong here is an error.
 
-    def load_overload(self, *args: Any) -> Any:
-        found = super().load_overload(*args)
+    Args:
+        function: the kernel.
+        numba_cache: Numba's own cache of it, which describes signatures and processors; None to compile in memory.
+    """
+
+    def __init__(self, function: Callable[..., Any], numba_cache: Any) -> None:
+        self._numba = numba_cache
+        self.cache_path = None
+        if numba_cache is not None:
+            numba_cache._cache_file  # noqa: B018 -- an AttributeError where Numba calls it something else
+            self.cache_path = numba_cache.cache_path
+            numba_cache._cache_file = _Files(Path(numba_cache.cache_path), function)
+
+    def load_overload(self, *arguments: Any) -> Any:
+        found = None
+        if self._numba is not None:
+            with suppress(Exception):  # however a file is damaged
+                found = self._numba.load_overload(*arguments)
         if found is None:
-            _announce(kept=True)
+            _announce(kept=self._numba is not None)
         return found
 
-    def save_overload(self, *args: Any) -> None:
+    def save_overload(self, *arguments: Any) -> None:
+        if self._numba is None:
+            return
         try:
-            super().save_overload(*args)
-        except OSError:  # a full or read-only disk costs time, not the result
-            self.disable()
+            self._numba.save_overload(*arguments)
+        except Exception as error:  # a full or read-only disk costs time, not the result
+            reason = getattr(error, "strerror", None) or type(error).__name__
+            _say(f"compiled code can't be kept, so that later runs compile again ({reason}: {self.cache_path})")
+
+    def flush(self) -> None:
+        if self._numba is not None:
+            self._numba.flush()
 
 
-class _NoCache(NullCache):
-    def load_overload(self, *args: Any) -> None:
-        _announce(kept=False)
+class _Files:
+    """Compiled code of one function, a file for each signature and processor: a digest, then the content.
+
+    The digest is over all that the content depends on and over the content itself. A file that is cut off, damaged, or
+    of another version of Numba or of the kernels isn't read any further; damaged machine code would end the process.
+    Each file is complete before it gets its name, so that two processes may save at once.
+    """
+
+    def __init__(self, folder: Path, function: Callable[..., Any]) -> None:
+        source = function.__code__.co_filename
+        self._folder = folder
+        name = f"{Path(source).stem}.{function.__qualname__}-{sys.implementation.cache_tag}"
+        self._name = re.sub(r"[^\w.-]", "", name)
+        self._stamp = numba.__version__.encode() + _text_of_kernels() + _text_of(source)
+
+    def load(self, key: Any) -> Any:
+        """What was saved under `key`, or None."""
+        try:
+            stored = self._path(key).read_bytes()
+        except OSError:
+            return None
+        digest, content = stored[:_DIGEST], stored[_DIGEST:]
+        return pickle.loads(content) if digest == self._digest(key, content) else None
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep `data` under `key`, in the place of what was there."""
+        content = pickle.dumps(data, protocol=pickle.HIGHEST_PROTOCOL)
+        path = self._path(key)
+        unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+        try:
+            unfinished.write_bytes(self._digest(key, content) + content)
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    def flush(self) -> None:
+        """Forget all that was saved."""
+        for path in self._folder.glob(f"{self._name}-*.kernel"):
+            path.unlink(missing_ok=True)
+
+    def _path(self, key: Any) -> Path:
+        return self._folder / f"{self._name}-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.kernel"
+
+    def _digest(self, key: Any, content: bytes) -> bytes:
+        return hashlib.sha256(self._stamp + repr(key).encode() + content).digest()
 
 
 @inlined

@@ -1,10 +1,20 @@
 """The benchmark's yardsticks do the same work as the simulator, and the benchmark runs."""
 
+import json
+import signal
+import subprocess
+import sys
+
 import numpy as np
+import pytest
 
 from agents import make_law
-from khop_env.bench import benchmark, environments
-from khop_env.bench.yardsticks import CompiledPaper
+from benchmarks import benchmark as module
+from benchmarks import environments, study
+from benchmarks.benchmark import benchmark
+from benchmarks.comparison import compare, left_out
+from benchmarks.report import Report
+from benchmarks.yardsticks import CompiledPaper
 from khop_env.observers import Explicit
 from khop_env.scenarios import paper
 
@@ -27,6 +37,7 @@ PARTS = {
     for scenario in ("paper", "convoy")
     for part in ("solve", "right-hand sides", "observation", "rest, Python and NumPy")
 }
+VMAS = ("order1", "order2", "threads2")
 RATES = {f"single_order{order}" for order in (1, 2)} | {
     f"vector_{scenario}_{what}" for scenario in ("paper", "convoy") for what in ("order1", "order2", "threads2", "jax")
 }
@@ -68,12 +79,14 @@ def test_ratios_to_peers(tmp_path, monkeypatch):
     for peer in ("mpe2", "jaxmarl"):  # and no VMAS
         (tmp_path / peer / "bin").mkdir(parents=True)
         (tmp_path / peer / "bin" / "python").touch()
-    rows = {}
-
-    def add(name, value, unit="x", target=""):
-        rows[name] = value, unit, target
-
-    environments.environment_rows(add, True, print, tmp_path)
+    report = Report()
+    environments.environment_rows(report, True, print, tmp_path)
+    skipped = {row["name"]: row["skipped"] for row in report.rows if row["skipped"] is not None}
+    assert set(skipped) == {f"vector_{scenario}_{what}_ratio" for scenario in ("paper", "convoy") for what in VMAS}
+    assert set(skipped.values()) == {f"no {tmp_path / 'vmas' / 'bin' / 'python'}: `make bench PEERS=1` installs it"}
+    rows = {
+        row["name"]: (row["value"], row["unit"], row["target"]) for row in report.rows if row["name"] not in skipped
+    }
     ratios = {name for name in rows if name.endswith("_ratio")}
     assert ratios == {f"{name}_ratio" for name in RATES if name.startswith("single") or name.endswith("jax")}
     for name in ratios:
@@ -83,3 +96,114 @@ def test_ratios_to_peers(tmp_path, monkeypatch):
         "aim 1",
     )
     assert asked[0] == (tmp_path / "mpe2" / "bin" / "python", "mpe2", 1, 1)
+
+
+def test_the_report_says_which_peers_are_missing(tmp_path):
+    assert left_out(None) == []
+    with pytest.raises(ValueError, match=r"--peers .*: expected virtual environments named mpe2, vmas, jaxmarl in it"):
+        left_out(tmp_path)
+    (tmp_path / "vmas" / "bin").mkdir(parents=True)
+    (tmp_path / "vmas" / "bin" / "python").touch()
+    assert [line.split(" (")[0] for line in left_out(tmp_path)] == ["ratios to mpe2", "ratios to jaxmarl"]
+
+
+def test_a_peer_that_fails_costs_its_ratio_only(tmp_path):
+    (tmp_path / "mpe2" / "bin").mkdir(parents=True)
+    (tmp_path / "mpe2" / "bin" / "python").touch()
+    asked = []
+
+    def theirs(python):
+        asked.append(python)
+        raise subprocess.CalledProcessError(1, "python", stderr="Traceback\nImportError: no mpe2\n")
+
+    report = Report()
+    compare(report, "rate", "1/s", lambda: 3.0, theirs, (tmp_path, "mpe2"), ("x", ""), 5)
+    assert [(row["name"], row["value"], row["skipped"]) for row in report.rows] == [
+        ("rate", 3.0, None),
+        ("rate_ratio", None, "mpe2 failed: ImportError: no mpe2"),
+    ]
+    assert len(asked) == 1
+
+
+@pytest.fixture
+def quick_parts(monkeypatch):
+    """The parts that need no more than the core, each a row."""
+    for index, name in enumerate(("_against_explicit", "_growth")):
+        monkeypatch.setattr(module, name, lambda add, *rest, index=index: add(f"row {index}", 1.0))
+    monkeypatch.setattr(module, "_ratio_to_floor", lambda quick: 2.0)
+    monkeypatch.setattr(module, "environment_rows", lambda report, *rest: report.add("row 2", np.inf))
+
+
+class NotInstalled:
+    """Packages that can't be imported."""
+
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("scipy", "stable_baselines3", "torch"):
+            raise ModuleNotFoundError(f"No module named {name!r}")
+
+
+def test_without_the_extras_the_rest_is_measured(quick_parts, monkeypatch):
+    for name in ("scipy", "stable_baselines3", "torch"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setattr(sys, "meta_path", [NotInstalled(), *sys.meta_path])
+    lines = []
+    report = benchmark(quick=True, progress=lines.append)
+    how = "pip install -c constraints.txt -e '.[bench]'"
+    assert lines[:3] == [
+        f"left out: proximal against SciPy's stiff solvers (needs scipy: {how})",
+        f"left out: training: PPO, 64 environments of 8 agents (needs stable_baselines3 and torch: {how})",
+        "proximal against explicit, closed loop of `paper`",
+    ]
+    assert [(row["name"], row["value"], row["skipped"]) for row in report["rows"]] == [
+        ("row 0", 1.0, None),
+        ("speedup_vs_scipy", None, f"needs scipy: {how}"),
+        ("speedup_vs_scipy_batch", None, f"needs scipy: {how}"),
+        ("ratio_to_floor", 2.0, None),
+        ("row 1", 1.0, None),
+        ("row 2", None, "came out as inf"),
+        ("training", None, f"needs stable_baselines3 and torch: {how}"),
+        ("training_environment_share", None, f"needs stable_baselines3 and torch: {how}"),
+    ]
+    assert (report["failed"], report["interrupted"]) == ([], False)
+    json.dumps(report, allow_nan=False)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("broken"), KeyboardInterrupt()], ids=["an error", "Ctrl-C"])
+def test_what_was_measured_is_not_lost(quick_parts, monkeypatch, error):
+    def broken(*arguments):
+        raise error
+
+    monkeypatch.setattr(module, "_against_scipy", broken)
+    monkeypatch.setattr(module, "training_rows", broken)
+    report = benchmark(quick=True)
+    if isinstance(error, KeyboardInterrupt):
+        assert [row["name"] for row in report["rows"]] == ["row 0"]
+        assert (report["failed"], report["interrupted"]) == ([], True)
+    else:
+        assert len(report["rows"]) == 6
+        assert report["rows"][1]["skipped"] == "failed: RuntimeError: broken"
+        assert report["failed"] == [
+            "proximal against SciPy's stiff solvers",
+            "training: PPO, 64 environments of 8 agents",
+        ]
+        assert not report["interrupted"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for a child there")
+def test_ctrl_c_ends_the_command_with_a_table():
+    command = [sys.executable, "-m", "khop_env", "bench", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr.readline().startswith("proximal against explicit")
+    process.send_signal(signal.SIGINT)
+    output, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert json.loads(output)["interrupted"] is True
+    assert "interrupted" in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("text", [None, "", "12", "12.5\n", "half a lin"])
+def test_a_training_of_the_study_whose_mark_is_damaged_has_not_finished(tmp_path, text):
+    if text is not None:
+        (tmp_path / study.DONE).write_text(text)
+    assert study.seconds_of(tmp_path) == {"12": 12.0, "12.5\n": 12.5}.get(text)

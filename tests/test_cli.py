@@ -313,21 +313,48 @@ class TestBench:
     def stand_in(self, monkeypatch):
         def benchmark(quick=False, progress=None, peers=None):
             progress("measuring")
-            rows = [{"name": "speedup", "value": 61.234567, "unit": "x", "target": ">= 60"}]
-            return {"rows": rows, "machine": "here", "quick": quick}
+            speedup = {"name": "speedup", "value": 61.234567, "unit": "x", "target": ">= 60", "skipped": None}
+            rows = [speedup] + [
+                {"name": name, "value": None, "unit": "", "target": "", "skipped": "needs scipy"} for name in "ab"
+            ]
+            return {"rows": rows, "machine": "here", "quick": quick, **self.ended}
 
-        module = types.ModuleType("khop_env.bench")
+        self.ended = {"failed": [], "interrupted": False}
+        module = types.ModuleType("benchmarks.benchmark")
         module.benchmark = benchmark
-        monkeypatch.setitem(sys.modules, "khop_env.bench", module)
+        monkeypatch.setitem(sys.modules, "benchmarks.benchmark", module)
 
     def test_table(self):
         result = khop("bench")
         assert "speedup" in result.stdout
         assert "61.23" in result.stdout
         assert result.stderr == "measuring\n"
+        assert [line.split() for line in result.stdout.splitlines() if "skipped" in line] == [
+            ["a", "skipped"],
+            ["b", "skipped"],
+            ["skipped:", "a,", "b:", "needs", "scipy"],
+        ]
 
     def test_json(self):
-        assert only_json(khop("bench", "--json", "--quick"))["quick"] is True
+        found = only_json(khop("bench", "--json", "--quick"))
+        assert found["quick"] is True
+        assert [row["skipped"] for row in found["rows"]] == [None, "needs scipy", "needs scipy"]
+
+    @pytest.mark.parametrize(
+        ("ended", "status"),
+        [({"failed": ["training"]}, 2), ({"interrupted": True}, 130)],
+        ids=["failed", "interrupted"],
+    )
+    def test_what_was_measured_is_printed_however_it_ends(self, ended, status):
+        self.ended |= ended
+        assert "61.23" in khop("bench", status=status).stdout
+        assert len(only_json(khop("bench", "--json", status=status))["rows"]) == 3
+
+    def test_a_wheel_is_without_it(self, monkeypatch, tmp_path):
+        monkeypatch.setattr("khop_env.commands.bench.REPOSITORY", tmp_path)
+        assert refused("bench") == (
+            "khop: benchmarks aren't installed, they are in khop_env's repository: run `make bench` in a clone of it"
+        )
 
 
 def test_version():

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("khop_env", "agents", "benchmarks")
+ON_DEMAND = ("khop_env.commands.bench", "benchmarks.benchmark")  # the one that runs what only a clone has
 
 # One line a rank; nothing imports from a later line. A new module has to be put in its place here.
 RANKS = [
@@ -21,16 +23,16 @@ RANKS = [
     ["khop_env.registry", "khop_env.consensus_v0", "khop_env.formation_v0", "khop_env.leader_following_v0"],
     ["khop_env.results"],
     ["agents"],
-    ["khop_env.bench"],
     ["khop_env.terminal"],
     ["khop_env.commands"],
     ["khop_env.cli", "khop_env.__main__"],
+    ["benchmarks"],  # not in the wheel, so that nothing may need it
 ]
 # Where a third-party package may be imported at all (architecture, last paragraph of the import order).
 HEAVY = {
-    "torch": ("agents", "khop_env.bench.peers"),  # the peers run in environments of their own
+    "torch": ("agents", "benchmarks.peers"),  # the peers run in environments of their own
     "ray": ("agents",),
-    "stable_baselines3": ("agents", "khop_env.env.sb3", "khop_env.bench.peers"),
+    "stable_baselines3": ("agents", "khop_env.env.sb3", "benchmarks.peers"),
     "matplotlib": ("khop_env.results", "khop_env.env.rendering"),
     "pygame": ("khop_env.env.rendering",),
     "imageio_ffmpeg": ("khop_env.results",),
@@ -39,9 +41,9 @@ NOT_ON_IMPORT = ("matplotlib", "pygame", "torch", "ray", "stable_baselines3", "p
 
 
 def modules() -> dict[str, Path]:
-    """All modules of both packages by name."""
+    """All modules by name."""
     found = {}
-    for package in ("khop_env", "agents"):
+    for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
@@ -85,12 +87,13 @@ def imports(module: str) -> list[tuple[int, str]]:
 
 @pytest.mark.parametrize("module", [name for name in MODULES if name != "khop_env"])
 def test_nothing_imports_to_its_right(module: str) -> None:
-    """physics < observers < simulation < env < scenarios < registry and *_v0 < results < agents < bench < cli."""
+    """physics < observers < simulation < env < scenarios < registry and *_v0 < results < agents < cli < benchmarks."""
     wrong = [
         f"line {line}: {module} imports {other}"
         for line, other in imports(module)
-        if other.split(".")[0] in ("khop_env", "agents")
+        if other.split(".")[0] in PACKAGES
         and other != "khop_env.__version__"
+        and (module, other) != ON_DEMAND
         and rank(other) > rank(module)
     ]
     assert not wrong, wrong
@@ -112,6 +115,16 @@ def test_ranks_name_existing_rooms_in_the_architecture_s_order() -> None:
         assert name == "khop_env" or rank(name) >= 0
     assert rank("khop_env.physics.graph") < rank("khop_env.observers") < rank("khop_env.simulation.plant")
     assert rank("khop_env.scenarios.paper") < rank("agents.laws") < rank("khop_env.cli")
+
+
+def test_only_one_command_runs_the_benchmarks_and_on_demand() -> None:
+    """The wheel is without them: every module of it can be imported there."""
+    module, other = ON_DEMAND
+    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module == other]
+    assert nodes
+    assert not set(nodes) & set(tree.body)
+    assert "benchmarks" not in loaded_by("import khop_env.cli")
 
 
 def loaded_by(statement: str) -> list[str]:

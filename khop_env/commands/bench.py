@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from khop_env.commands.common import JsonOption, print_json
+from khop_env.commands.common import JsonOption, mistakes, print_json
 from khop_env.terminal import print_table, say
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 
 
 def bench(
@@ -18,20 +23,40 @@ def bench(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure speed and memory against explicit, SciPy's and bare loops, and other libraries' environments."""
-    from khop_env.bench import benchmark
+    """Measure speed and memory against explicit, SciPy's and bare loops, and other libraries' environments.
 
-    result = benchmark(quick=quick, progress=say, peers=peers)
+    It runs in a clone of the repository. Exit status 2 if a part failed, and 130 after Ctrl-C; what was measured is
+    printed all the same.
+    """
+    with mistakes():
+        result = _benchmark()(quick=quick, progress=say, peers=peers)
     if as_json:
         print_json(result)
-        return
-    rows = [
-        tuple("" if row.get(key) is None else row[key] for key in ("name", "value", "unit", "target"))
-        for row in result["rows"]
-    ]
-    print_table(("measure", "value", "unit", "target"), [tuple(_short(cell) for cell in row) for row in rows])
-    typer.echo(f"machine: {result.get('machine')}")
+    else:
+        rows = [(row["name"], _value(row), row["unit"], row["target"]) for row in result["rows"]]
+        print_table(("measure", "value", "unit", "target"), rows)
+        for reason in dict.fromkeys(row["skipped"] for row in result["rows"] if row["skipped"] is not None):
+            names = ", ".join(row["name"] for row in result["rows"] if row["skipped"] == reason)
+            typer.echo(f"skipped: {names}: {reason}")
+        typer.echo(f"machine: {result['machine']}")
+    if result["interrupted"]:
+        say("khop: interrupted; what is missing wasn't measured")
+        raise typer.Exit(INTERRUPTED)
+    if result["failed"]:
+        raise typer.Exit(2)
 
 
-def _short(cell: Any) -> str:
-    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+def _benchmark() -> Callable[..., dict[str, Any]]:
+    if not (REPOSITORY / "benchmarks" / "yardsticks.py").exists():
+        raise ModuleNotFoundError(
+            "benchmarks aren't installed, they are in khop_env's repository: run `make bench` in a clone of it"
+        )
+    if str(REPOSITORY) not in sys.path:
+        sys.path.insert(0, str(REPOSITORY))
+    from benchmarks.benchmark import benchmark
+
+    return benchmark
+
+
+def _value(row: dict[str, Any]) -> str:
+    return f"{row['value']:.4g}" if row["skipped"] is None else "skipped"

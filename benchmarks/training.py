@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from khop_env.bench.environments import run_peer
+from benchmarks.comparison import compare, run_peer
+from benchmarks.report import Report
 
-TURNS = 3  # the two sides of the ratio take turns, so that the machine's mood meets both
+TURNS = 3  # of the two sides of the ratio
 
 
 def training_rate(timesteps: int) -> tuple[float, float]:
@@ -47,29 +47,30 @@ def training_rate(timesteps: int) -> tuple[float, float]:
     return (model.num_timesteps - before) / wall, spent / wall
 
 
-def training_rows(add: Callable[..., None], quick: bool, say: Callable[[str], None], peers: Path | None) -> None:
-    """Print the throughput, and its ratio to the same PPO on MPE2 if that is installed in `peers`/mpe2.
+def training_rows(report: Report, quick: bool, peers: Path | None) -> None:
+    """Measure the throughput, and its ratio to the same PPO on MPE2 if that is installed in `peers`/mpe2.
 
     Args:
-        add: takes a row's name, value, unit and target.
+        report: takes the rows.
         quick: as `benchmark`.
-        say: told what is going on.
         peers: folder with one virtual environment per peer; None to leave them out.
     """
     timesteps = 8_192 if quick else 200_000
-    say("training: PPO, 64 environments of 8 agents")
-    python = None if peers is None else peers / "mpe2" / "bin" / "python"
-    if python is not None and not python.exists():
-        python = None
-    mine, theirs, shares = [], [], []
-    for _ in range(TURNS if python is not None and not quick else 1):
-        rate, share = training_rate(timesteps)
-        mine.append(rate)
+    shares: list[float] = []
+
+    def rate() -> float:
+        found, share = training_rate(timesteps)
         shares.append(share)
-        if python is not None:
-            theirs.append(run_peer(python, "mpe2_train.py", 8_192 if quick else 40_960))
-    add("training", statistics.median(mine), "agent-steps/s in learn")
-    add("training_environment_share", statistics.median(shares), "of the wall time", "at most 0.3")
-    if theirs:
-        ratio = statistics.median(mine) / statistics.median(theirs)
-        add("training_ratio", ratio, "x MPE2 simple_spread, SuperSuit, the same PPO", "at least 3")
+        return found
+
+    compare(
+        report,
+        "training",
+        "agent-steps/s in learn",
+        rate,
+        lambda python: run_peer(python, "mpe2_train.py", 8_192 if quick else 40_960),
+        (peers, "mpe2"),
+        ("x MPE2 simple_spread, SuperSuit, the same PPO", "at least 3"),
+        1 if quick else TURNS,
+    )
+    report.add("training_environment_share", statistics.median(shares), "of the wall time", "at most 0.3")

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import os
-import statistics
-import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.comparison import compare, run_peer
+from benchmarks.report import Report
 from khop_env import consensus_v0
 from khop_env.env import BatchedEnv, KHopEnv, Settings
 
 BATCH = 1024
-PEERS = Path(__file__).parent / "peers"
-TURNS = 5  # the two sides of a ratio take turns, so that the machine's mood meets both
+TURNS = 5  # of the two sides of a ratio
 Rate = Callable[[float], float]
 """Agent-steps per second, measured for about so many seconds."""
 
@@ -89,15 +87,16 @@ def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str
     return {name: seconds / (steps * env.num_envs) * 1e6 for name, seconds in spent.items()}
 
 
-def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str], None], peers: Path | None) -> None:
-    """Print rates and shares; and ratios to the peers installed in the environments under `peers`.
+def environment_rows(report: Report, quick: bool, say: Callable[[str], None], peers: Path | None) -> None:
+    """Measure rates and shares; and ratios to the peers installed in the environments under `peers`.
 
     Args:
-        add: takes a row's name, value, unit and target.
+        report: takes the rows.
         quick: as `benchmark`.
-        say: told what is going on.
+        say: called with a line before each row.
         peers: folder with one virtual environment per peer, named mpe2, vmas, jaxmarl; None to leave them out.
     """
+    add = report.add
     seconds, batch = (0.05, 64) if quick else (1.0, BATCH)
     settings = Settings()  # the defaults, which all rows have but for the order and the threads that they name
     add("environment_control_period", settings.control_period, "s between actions, in all rows below")
@@ -127,16 +126,16 @@ def environment_rows(add: Callable[..., None], quick: bool, say: Callable[[str],
         plan.append((f"vector_{scenario}_jax", name, ours(scenario, 1, 1), "jaxmarl", batch, 1, "aim 1"))
     for name, peer_name, rate, peer, size, threads, target in plan:
         say(f"environments: {name}")
-        python = None if peers is None else peers / peer / "bin" / "python"
-        if python is None or not python.exists():
-            add(name, rate(seconds), "agent-steps/s")
-            continue
-        mine, theirs = [], []
-        for _ in range(1 if quick else TURNS):
-            mine.append(rate(seconds))
-            theirs.append(_peer_rate(python, peer, size, threads, seconds))
-        add(name, statistics.median(mine), "agent-steps/s")
-        add(f"{name}_ratio", statistics.median(mine) / statistics.median(theirs), f"x {peer_name}", target)
+        compare(
+            report,
+            name,
+            "agent-steps/s",
+            partial(rate, seconds),
+            partial(_peer_rate, peer=peer, batch=size, threads=threads, seconds=seconds),
+            (peers, peer),
+            (f"x {peer_name}", target),
+            1 if quick else TURNS,
+        )
 
 
 def _single(order: int) -> Rate:
@@ -145,21 +144,6 @@ def _single(order: int) -> Rate:
 
 def _peer_rate(python: Path, peer: str, batch: int, threads: int, seconds: float) -> float:
     return run_peer(python, f"{peer}_rate.py", batch, threads, seconds, threads=threads)
-
-
-def run_peer(python: Path, script: str, *arguments: float, threads: int = 1) -> float:
-    """Agent-steps per second that a script of `peers/` prints.
-
-    Args:
-        python: of the environment that the peer is installed in.
-        script: its file name.
-        arguments: of the script.
-        threads: that the peer's own libraries may use.
-    """
-    command = [str(python), str(PEERS / script), *map(str, arguments)]
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    return float(json.loads(done.stdout.splitlines()[-1])["agent_steps_per_s"])
 
 
 def _timed(function: Callable[..., Any], name: str, spent: dict[str, float]) -> Callable[..., Any]:

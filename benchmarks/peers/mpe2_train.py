@@ -1,7 +1,7 @@
 """Agent-steps per second inside PPO.learn on MPE2's simple_spread, 64 environments of 8 agents, through SuperSuit.
 
 Run in an environment with mpe2, supersuit and stable-baselines3. The hyper-parameters are those of
-`khop_env.bench.training`.
+`benchmarks.training`.
 """
 
 import json

@@ -1,6 +1,6 @@
 """Train, measure and write docs/learning.md, docs/learning.png and the shipped policies: one to two hours on two cores.
 
-    .venv/bin/python examples/learning/publish_table.py
+    .venv/bin/python -m benchmarks.publish_table
 
 What has finished isn't trained again (runs/study); the pretrained policies are those that seed 0 trained on estimates.
 """
@@ -13,9 +13,9 @@ from datetime import date
 from pathlib import Path
 
 from agents.learning import PRETRAINED, TrainingConfig, pretrained_name
-from agents.learning.study import EPISODES, SEEDS, TASKS, folder_of, largest_ratio, measure, table, train_all
 from agents.learning.training import EVALUATION_SEEDS
 from agents.policy import describe
+from benchmarks.study import EPISODES, SEEDS, TASKS, folder_of, largest_ratio, measure, table, train_all
 from khop_env.registry import environment_module
 from khop_env.results import learning_curves
 
@@ -26,6 +26,7 @@ parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of t
 
 
 def main() -> None:
+    """Train what isn't trained yet, measure, write."""
     given = parser.parse_args()
     train_all(given.root, workers=given.workers, say=lambda text: print(text, flush=True))
     blocks = [measure(given.root, task, workers=given.workers) for task in TASKS]
@@ -36,7 +37,7 @@ def main() -> None:
     budgets = ", ".join(f"{task.timesteps / 1e6:g} million on {task.label}" for task in TASKS)
     text = [
         "# Learned policies, measured\n",
-        f"Written by `python examples/learning/publish_table.py` on {date.today().isoformat()}: {len(SEEDS)} training "
+        f"Written by `python -m benchmarks.publish_table` on {date.today().isoformat()}: {len(SEEDS)} training "
         f"seeds for each kind of observation, {len(EPISODES)} evaluation episodes, the same for every row and other "
         f"than those that policies were trained, selected or tuned on. The trainings took {hours:.1f} hours of wall "
         f"time added up, {given.workers} at a time on {os.cpu_count()} shared cores ({platform.machine()}, no GPU); "

@@ -118,6 +118,18 @@ def folder_of(root: Path, task: StudyTask, variant: str, seed: int) -> Path:
     return root / f"{task.environment}-{scenario}" / f"{variant.replace(' + ', '-')}-{seed}"
 
 
+def seconds_of(folder: Path) -> float | None:
+    """How long the finished training of a folder took, in s; None where it hasn't finished, or its mark is damaged.
+
+    Args:
+        folder: of one run.
+    """
+    try:
+        return float((folder / DONE).read_text())
+    except (OSError, ValueError):
+        return None
+
+
 def train_all(
     root: Path,
     tasks: Sequence[StudyTask] = TASKS,
@@ -140,7 +152,7 @@ def train_all(
         for seed in seeds
         for task in tasks
         for variant in VARIANTS
-        if not (folder_of(root, task, variant, seed) / DONE).exists()
+        if seconds_of(folder_of(root, task, variant, seed)) is None
     ]
     start = time.perf_counter()
     spawned = multiprocessing.get_context("spawn")
@@ -186,7 +198,7 @@ def measure(
         for seed in seeds:
             folder = folder_of(root, task, variant, seed)
             found.append(np.loadtxt(folder / "curve.csv", delimiter=",", skiprows=1))
-            seconds += float((folder / DONE).read_text())
+            seconds += seconds_of(folder) or 0.0
         shortest = min(map(len, found))
         curves[variant] = np.array([one[:shortest, 1] for one in found])
         steps = found[0][:shortest, 0]

@@ -5,23 +5,27 @@ Every figure is a ratio of times taken in this run, each the best of several rep
 
 from __future__ import annotations
 
-import functools
+import importlib.util
 import os
 import platform
 import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents import make_law
-from khop_env.bench.environments import environment_rows
-from khop_env.bench.training import training_rows
-from khop_env.bench.yardsticks import CompiledPaper, bare_loop
+from benchmarks.comparison import left_out
+from benchmarks.environments import environment_rows
+from benchmarks.report import Report, reason
+from benchmarks.training import training_rows
+from benchmarks.yardsticks import CompiledPaper, bare_loop
 from khop_env.observers import FloatArray, Proximal
 from khop_env.observers.solve import solve
 from khop_env.scenarios import Scenario, paper, random_geometric
@@ -32,36 +36,99 @@ ACCURACY = 2e-3  # largest error of x that a method may make over it
 DT = 0.01
 EXPLICIT_DT = 1e-5
 BATCH = 64
+ROOT = Path(__file__).resolve().parents[1]  # of the repository
+SCIPY_ROWS = ("speedup_vs_scipy", "speedup_vs_scipy_batch")
 Progress = Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Part:
+    """Some rows of the table.
+
+    Attributes:
+        name: what is measured.
+        measure: adds the rows.
+        needs: packages that the core doesn't install.
+        rows: names of the rows that there are not without these packages.
+    """
+
+    name: str
+    measure: Callable[[], None]
+    needs: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()
+
+
 def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path | None = None) -> dict[str, Any]:
-    """Run all benchmarks.
+    """Run all benchmarks; those whose packages aren't installed are left out, and an interrupt ends with what there is.
 
     Args:
         quick: a hundredth of the work, to see that everything runs; the figures mean little.
-        progress: called with a line before each part.
+        progress: called with a line for each part that is left out, before anything is measured; then before each part.
         peers: folder with virtual environments of other libraries to compare environments with; None to leave it out.
 
     Returns:
-        "machine" and "rows", each row with name, value, unit and target (the bound that the project sets itself).
+        "machine"; "rows", see `Report`; "failed", the parts that ended with an error; and "interrupted".
+
+    Raises:
+        ValueError: if there is no peer in `peers`.
     """
     say = progress or (lambda line: None)
-    rows: list[dict[str, Any]] = []
+    report = Report()
+    parts = (
+        Part("proximal against explicit, closed loop of `paper`", partial(_against_explicit, report.add, quick)),
+        Part(
+            "proximal against SciPy's stiff solvers",
+            partial(_against_scipy, report, quick, say),
+            needs=("scipy",),
+            rows=SCIPY_ROWS,
+        ),
+        Part(
+            "the solve against its bare arithmetic",
+            lambda: report.add("ratio_to_floor", _ratio_to_floor(quick), target="at most 6"),
+        ),
+        Part("growth with the number of agents", partial(_growth, report.add, quick, say)),
+        Part("environments", partial(environment_rows, report, quick, say, peers)),
+        Part(
+            "training: PPO, 64 environments of 8 agents",
+            partial(training_rows, report, quick, peers),
+            needs=("stable_baselines3", "torch"),
+            rows=("training", "training_environment_share"),
+        ),
+    )
+    missing = {part.name: [name for name in part.needs if not _installed(name)] for part in parts}
+    for part in parts:
+        if missing[part.name]:
+            say(f"left out: {part.name} ({_to_install(missing[part.name])})")
+    for line in left_out(peers):
+        say(f"left out: {line}")
+    failed, interrupted = [], False
+    try:
+        for part in parts:
+            if missing[part.name]:
+                for name in part.rows:
+                    report.skip(name, _to_install(missing[part.name]))
+                continue
+            say(part.name)
+            try:
+                part.measure()
+            except Exception as error:  # the other parts' rows are worth having
+                report.skip(part.name, f"failed: {reason(error)}")
+                say(f"{part.name} failed: {reason(error)}")
+                failed.append(part.name)
+    except KeyboardInterrupt:
+        interrupted = True
+    return {"machine": _machine(), "rows": report.rows, "failed": failed, "interrupted": interrupted}
 
-    def add(name: str, value: float | None, unit: str = "x", target: str = "") -> None:
-        rows.append({"name": name, "value": None if value is None else float(value), "unit": unit, "target": target})
 
-    say("proximal against explicit, closed loop of `paper`")
-    _against_explicit(add, quick)
-    say("proximal against SciPy's stiff solvers")
-    _against_scipy(add, quick, say)
-    say("the solve against its bare arithmetic")
-    add("ratio_to_floor", _ratio_to_floor(quick), target="at most 6")
-    _growth(add, quick, say)
-    environment_rows(add, quick, say, peers)
-    training_rows(add, quick, say, peers)
-    return {"machine": _machine(), "rows": rows}
+def _installed(package: str) -> bool:
+    try:
+        return importlib.util.find_spec(package) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def _to_install(packages: Sequence[str]) -> str:
+    return f"needs {' and '.join(packages)}: pip install -c constraints.txt -e '.[bench]'"
 
 
 def _best(action: Callable[[], object], repeats: int) -> float:
@@ -102,12 +169,12 @@ def _against_explicit(add: Callable[..., None], quick: bool) -> None:
     for batch, suffix, target in ((BATCH, "", "at least 60, aim 100"), (1, "_single", "at least 25")):
         simulator = _simulator(paper(), batch)
         _run(simulator, DT, 10 * DT)
-        proximal = _best(functools.partial(_run, simulator, DT, duration), 2 if batch > 1 else 5) / duration
+        proximal = _best(partial(_run, simulator, DT, duration), 2 if batch > 1 else 5) / duration
         simulator.reset(seed=0)
         loop = CompiledPaper(simulator)
         loop.run(EXPLICIT_DT, 10)
         steps = 200 if quick else (20_000 if batch > 1 else 200_000)  # of equal cost, so a part of the 10 s will do
-        explicit = _best(functools.partial(loop.run, EXPLICIT_DT, steps), 2) / (steps * EXPLICIT_DT)
+        explicit = _best(partial(loop.run, EXPLICIT_DT, steps), 2) / (steps * EXPLICIT_DT)
         add(f"speedup_vs_explicit{suffix}", explicit / proximal, target=target)
         elements = 2 * simulator.design.states.layout.size * batch  # state and input observers
         bare = _bare_time(elements, steps) / (steps * EXPLICIT_DT)
@@ -123,14 +190,10 @@ def _bare_time(elements: int, repeats: int) -> float:
     return _best(lambda: bare_loop(e, slope, curvature, repeats), 3)
 
 
-def _against_scipy(add: Callable[..., None], quick: bool, say: Progress) -> None:
+def _against_scipy(report: Report, quick: bool, say: Progress) -> None:
     """The loosest tolerance of each stiff solver that keeps the accuracy, on the same right-hand side, compiled."""
-    try:
-        from scipy.integrate import solve_ivp
-    except ImportError:
-        say("SciPy isn't installed (pip install 'khop_env[bench]'): left out")
-        add("speedup_vs_scipy", None, target="at least 20, aim 50")
-        return
+    from scipy.integrate import solve_ivp
+
     duration = 0.2 if quick else DURATION
     reference = _trajectory(DT / 20, duration, every=20)
     times = DT * np.arange(1, len(reference) + 1)
@@ -164,8 +227,12 @@ def _against_scipy(add: Callable[..., None], quick: bool, say: Progress) -> None
                 break
         else:
             say(f"  {method}: {ACCURACY:g} not reached with rtol down to 1e-4")
-    add("speedup_vs_scipy", best / ours, target="at least 20, aim 50")
-    add("speedup_vs_scipy_batch", best / ours_many, target="")
+    if best == np.inf:
+        for name in SCIPY_ROWS:
+            report.skip(name, f"no solver kept the error below {ACCURACY:g}")
+        return
+    report.add("speedup_vs_scipy", best / ours, target="at least 20, aim 50")
+    report.add("speedup_vs_scipy_batch", best / ours_many)
 
 
 def _ratio_to_floor(quick: bool, batch: int = 1024) -> float:
@@ -210,7 +277,7 @@ def _growth(add: Callable[..., None], quick: bool, say: Progress) -> None:
     for _ in range(3 if quick else 15):
         for index, (agents, simulator) in enumerate(zip(sizes, simulators, strict=True)):
             steps = max(2, 10_000 // agents)
-            seconds[index] = min(seconds[index], _best(functools.partial(_steps, simulator, steps), 1) / steps)
+            seconds[index] = min(seconds[index], _best(partial(_steps, simulator, steps), 1) / steps)
     for index, agents in enumerate(sizes):
         add(f"step_{agents}", seconds[index] / pairs[index] * 1e9, "ns per pair and step")
         add(f"memory_{agents}", held[index] / pairs[index], "bytes per pair")
@@ -218,8 +285,8 @@ def _growth(add: Callable[..., None], quick: bool, say: Progress) -> None:
         per_pair = np.array(values) / pairs
         add(name, per_pair.max() / per_pair.min(), target="at most 1.5")
     say(f"memory of a process with {sizes[-1]} agents")
-    script = f"from khop_env.bench.benchmark import peak_memory; print(peak_memory({sizes[-1]}))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    script = f"from benchmarks.benchmark import peak_memory; print(peak_memory({sizes[-1]}))"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
     add(f"peak_{sizes[-1]}", float(done.stdout.split()[-1]) / 2**20, "MiB", "below 1024")
 
 
