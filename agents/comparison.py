@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import concurrent.futures
-import inspect
 import math
 import multiprocessing
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ from agents.policies import make_policy
 from agents.policy import EnvDescription, describe
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
-from khop_env.registry import environment_module
+from khop_env.registry import make_batched, task_class
 from khop_env.results.metrics import finite
 from khop_env.results.recording import Progress
 from khop_env.simulation import Observe
@@ -138,8 +137,7 @@ def compare(
     """
     if not len(seeds):
         raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
-    module = environment_module(environment)
-    name = inspect.signature(module.batched_env).parameters["scenario"].default if scenario is None else scenario
+    name = task_class(environment).default_scenario if scenario is None else scenario
     if not policies or not observe or len(set(observe)) < len(observe):
         raise ValueError(f"name at least one policy and one observation mode, each once; got {list(observe)}")
     asked: dict[str, _Arguments] = {}
@@ -214,5 +212,4 @@ def _play_task(task: _Task) -> Episodes:
 
 @lru_cache(maxsize=6)  # three modes, with and without bounds
 def _environment(environment: str, scenario: str, observe: Observe, arguments: _Arguments) -> BatchedEnv:
-    make: Callable[..., BatchedEnv] = environment_module(environment).batched_env
-    return make(scenario, num_envs=CHUNK, observe=observe, **dict(arguments))
+    return make_batched(environment, scenario, num_envs=CHUNK, observe=observe, **dict(arguments))

@@ -135,7 +135,7 @@ def play(
         try:
             parts.append(_play(batched, policy, filled, len(mine)))
         except ValueError as error:
-            raise ValueError(f"policy {name!r} in {batched.task.name}_v0: {error}") from error
+            raise ValueError(f"policy {name!r} in {batched.task.environment}: {error}") from error
         if progress is not None:
             progress(min(1.0, (first + batched.num_envs) / len(seeds)))
     return Episodes.joined(parts)

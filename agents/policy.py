@@ -78,7 +78,7 @@ def describe(env: BatchedEnv | KHopEnv | KHopVectorEnv | JointEnv) -> EnvDescrip
     batched = batched_of(env)
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
     return EnvDescription(
-        environment=f"{batched.task.name}_v0",
+        environment=batched.task.environment,
         scenario=batched.scenario,
         observe=batched.settings.observe,
         control_period=batched.settings.control_period,

@@ -11,9 +11,9 @@ import numpy as np
 from agents.learning.learned import PretrainedPolicy, pretrained_for
 from agents.policies import make_policy
 from agents.policy import Policy, describe, policy_seeds
-from khop_env.env import EnvState, KHopEnv, Settings
+from khop_env.env import KHopEnv, Settings
 from khop_env.observers import Extremes
-from khop_env.registry import environment_module
+from khop_env.registry import make
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
 
@@ -32,7 +32,7 @@ class PolicyRun:
         self.simulator: Simulator = env.batched.simulator
         policy.reset(describe(env), policy_seeds([seed]))
         self._observations, _ = env.reset(seed=seed)
-        self._extremes = np.zeros((4, 1))
+        self._extremes = self.simulator.extremes
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.simulator, name)
@@ -46,26 +46,18 @@ class PolicyRun:
     @property
     def extremes(self) -> Extremes:
         """The largest ratios since the reset, not only since the last action."""
-        return Extremes(*self._extremes.copy())
+        return self._extremes.copied()
+
+    def task_error(self) -> float:
+        """Mean over the agents of their task error now."""
+        return float(self.env.batched.task_errors().mean())
 
     def step(self, dt: float) -> None:
-        """One control period, or, when `record` warms up, one short step of the simulator."""
-        if dt < 1e-6:
-            self.simulator.step(dt)
-            return
+        """One control period, whose length `dt` has to be."""
         actions: Mapping[str, Any] = self.policy.act(self._observations)
         self._observations, *_ = self.env.step(actions)
-        seen = self.simulator.extremes
-        values = seen.normalized, seen.relative, seen.input_normalized, seen.input_relative
-        self._extremes = np.maximum(self._extremes, values)
-
-    def save(self) -> EnvState:
-        """The environment's state."""
-        return self.env.get_state()
-
-    def restore(self, saved: EnvState) -> None:
-        """Back to it."""
-        self.env.set_state(saved)
+        for running, now in zip(self._extremes, self.simulator.extremes, strict=True):
+            np.maximum(running, now, out=running)
 
 
 def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float, seed: int) -> PolicyRun:
@@ -83,7 +75,6 @@ def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float,
     """
     policy = make_policy(spec)
     about = pretrained_for(scenario.name) if isinstance(policy, PretrainedPolicy) else policy.about  # type: ignore[attr-defined]
-    make = environment_module(about["environment"]).parallel_env
     cycles = max(1, math.ceil(duration / Settings.control_period - 1e-9))
-    env: KHopEnv = make(scenario, observe=observe, bounds=about["bounds"], max_cycles=cycles)
+    env = make(about["environment"], scenario, observe=observe, bounds=about["bounds"], max_cycles=cycles)
     return PolicyRun(env, policy, seed)

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from agents.laws import make_law
 from agents.lyapunov import ComparisonGain
-from khop_env.env import consensus
 from khop_env.observers import DesignError, Exponential, FloatArray, TargetObservers
 from khop_env.results.metrics import consensus_error, finite
 from khop_env.results.recording import Progress
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Law, Simulator, View
+from khop_env.tasks import directed
 
 SIZES = tuple(float(f"{size:.3g}") for size in np.geomspace(0.02, 2.0, 7))  # m
 FACTORS = tuple(float(f"{factor:.3g}") for factor in np.geomspace(10.0, 0.1, 7))  # of the scenario's delta(inf)
@@ -106,7 +106,7 @@ def injected_errors(
         None where that says nothing).
     """
     calm, bound, batch = scenario.replace(disturbance=None), analytical_gain(scenario), episodes * len(PATTERNS)
-    edges = consensus(calm.fleet, calm.task).edges
+    edges = directed(calm.task)
     unheard = np.array([not calm.communication.has_edge(i, j) for i, j in edges.tolist()], bool)
     x0 = [calm.initial.draw(np.random.default_rng(seed + b // len(PATTERNS))) for b in range(batch)]
     steps = round(calm.duration / calm.dt)
@@ -300,7 +300,7 @@ def _read_columns(scenario: Scenario) -> tuple[NDArray[np.int64], NDArray[np.int
     """Columns of the estimates that the law reads, and of the states that they are estimates of."""
     fleet, slot = scenario.fleet, scenario.design.states.layout.slot
     read, truth = [], []
-    for i, j in consensus(fleet, scenario.task).edges.tolist():
+    for i, j in directed(scenario.task).tolist():
         if not scenario.communication.has_edge(i, j):
             read.append(slot[i, j] + fleet.position_index[j] - fleet.state_offset[j])
             truth.append(fleet.position_index[j])

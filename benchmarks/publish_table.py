@@ -16,7 +16,7 @@ from agents.learning import PRETRAINED, TrainingConfig, pretrained_name
 from agents.learning.training import EVALUATION_SEEDS
 from agents.policy import describe
 from benchmarks.study import EPISODES, SEEDS, TASKS, folder_of, largest_ratio, measure, table, train_all
-from khop_env.registry import environment_module
+from khop_env.registry import make_batched
 from khop_env.results import learning_curves
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -64,7 +64,7 @@ def main() -> None:
     learning_curves(curves, given.docs / "learning.png")
     PRETRAINED.mkdir(exist_ok=True)
     for task in TASKS:
-        name = describe(environment_module(task.environment).batched_env(task.scenario)).scenario
+        name = describe(make_batched(task.environment, task.scenario)).scenario
         best = folder_of(given.root, task, "estimate", 0) / "best.npz"
         shutil.copyfile(best, PRETRAINED / f"{pretrained_name(task.environment, name)}.npz")
     print("\n".join(text))

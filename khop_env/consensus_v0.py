@@ -122,36 +122,47 @@ and counted in the infos
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 from pettingzoo import AECEnv
-from pettingzoo.utils import parallel_to_aec
 
-from khop_env.env import BatchedEnv, KHopEnv, consensus
-from khop_env.registry import assemble
+from khop_env.env import BatchedEnv, KHopEnv, SettingsArguments
+from khop_env.registry import make, make_aec, make_batched, spelled_out
 from khop_env.scenarios import Scenario
+from khop_env.tasks import Consensus, EdgeArguments
 
 __all__ = ["batched_env", "env", "parallel_env", "raw_env"]
 
 
-def batched_env(scenario: Scenario | str | Path = "paper", *, num_envs: int = 1, **arguments: Any) -> BatchedEnv:
-    """`num_envs` copies as arrays (copies, agents, ...); arguments as listed at the top of this module."""
-    return assemble(scenario, lambda chosen: consensus(chosen.fleet, chosen.task), num_envs, arguments)
+class Arguments(EdgeArguments, SettingsArguments, total=False):
+    """Keyword arguments of this environment."""
 
 
+@spelled_out(Consensus)
+def batched_env(
+    scenario: Scenario | str | Path = "paper", *, num_envs: int = 1, **arguments: Unpack[Arguments]
+) -> BatchedEnv:
+    """`num_envs` copies as arrays (copies, agents, ...); arguments are described at the top of this module."""
+    return make_batched(Consensus, scenario, num_envs=num_envs, **arguments)
+
+
+@spelled_out(Consensus)
 def parallel_env(
-    scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Any
+    scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> KHopEnv:
-    """The PettingZoo ParallelEnv; arguments as listed at the top of this module."""
-    return KHopEnv(batched_env(scenario, **arguments), name="consensus_v0", render_mode=render_mode)
+    """The PettingZoo ParallelEnv; arguments are described at the top of this module."""
+    return make(Consensus, scenario, render_mode=render_mode, **arguments)
 
 
-def env(scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Any) -> AECEnv:
-    """The AEC environment, by PettingZoo's own conversion; arguments as listed at the top of this module.
+@spelled_out(Consensus)
+def env(
+    scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
+) -> AECEnv:
+    """The AEC environment, by PettingZoo's own conversion; arguments are described at the top of this module.
 
-    What an observation holds: `aec.unwrapped.layout(agent)`.
+    `aec.unwrapped.layout(agent)` names the columns of an observation.
     """
-    return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **arguments))
+    return make_aec(Consensus, scenario, render_mode=render_mode, **arguments)
 
 
 raw_env = env

@@ -133,44 +133,54 @@ and counted in the infos
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 from pettingzoo import AECEnv
-from pettingzoo.utils import parallel_to_aec
 
-from khop_env.env import BatchedEnv, KHopEnv, Task, leader_following
-from khop_env.registry import assemble
+from khop_env.env import BatchedEnv, KHopEnv, SettingsArguments
+from khop_env.registry import make, make_aec, make_batched, spelled_out
 from khop_env.scenarios import Scenario
+from khop_env.tasks import EdgeArguments, LeaderFollowing
 
 __all__ = ["batched_env", "env", "parallel_env", "raw_env"]
 
-OWN = ("leaders", "follow", "leader_speed", "spacing")
+
+class Arguments(EdgeArguments, SettingsArguments, total=False):
+    """Keyword arguments of this environment."""
+
+    leaders: int | Sequence[str | int] | None
+    follow: Mapping[str, str] | None
+    leader_speed: float | None
+    spacing: float
 
 
-def batched_env(scenario: Scenario | str | Path = "convoy", *, num_envs: int = 1, **arguments: Any) -> BatchedEnv:
-    """`num_envs` copies as arrays (copies, agents, ...); arguments as listed at the top of this module."""
-    own = {name: arguments.pop(name) for name in OWN if name in arguments}
-
-    def task(chosen: Scenario) -> Task:
-        return leader_following(chosen.fleet, chosen.communication, chosen.k, **own)
-
-    return assemble(scenario, task, num_envs, arguments, OWN)
+@spelled_out(LeaderFollowing)
+def batched_env(
+    scenario: Scenario | str | Path = "convoy", *, num_envs: int = 1, **arguments: Unpack[Arguments]
+) -> BatchedEnv:
+    """`num_envs` copies as arrays (copies, agents, ...); arguments are described at the top of this module."""
+    return make_batched(LeaderFollowing, scenario, num_envs=num_envs, **arguments)
 
 
+@spelled_out(LeaderFollowing)
 def parallel_env(
-    scenario: Scenario | str | Path = "convoy", *, render_mode: str | None = None, **arguments: Any
+    scenario: Scenario | str | Path = "convoy", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> KHopEnv:
-    """The PettingZoo ParallelEnv; arguments as listed at the top of this module."""
-    return KHopEnv(batched_env(scenario, **arguments), name="leader_following_v0", render_mode=render_mode)
+    """The PettingZoo ParallelEnv; arguments are described at the top of this module."""
+    return make(LeaderFollowing, scenario, render_mode=render_mode, **arguments)
 
 
-def env(scenario: Scenario | str | Path = "convoy", *, render_mode: str | None = None, **arguments: Any) -> AECEnv:
-    """The AEC environment, by PettingZoo's own conversion; arguments as listed at the top of this module.
+@spelled_out(LeaderFollowing)
+def env(
+    scenario: Scenario | str | Path = "convoy", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
+) -> AECEnv:
+    """The AEC environment, by PettingZoo's own conversion; arguments are described at the top of this module.
 
-    What an observation holds: `aec.unwrapped.layout(agent)`.
+    `aec.unwrapped.layout(agent)` names the columns of an observation.
     """
-    return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **arguments))
+    return make_aec(LeaderFollowing, scenario, render_mode=render_mode, **arguments)
 
 
 raw_env = env

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
+import dataclasses
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
 
 import numpy as np
 
-from khop_env.env import BatchedEnv, JointEnv, KHopVectorEnv, Settings, Task
+import khop_env.tasks
+from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
+from khop_env.environments import ENVIRONMENTS
 from khop_env.observers import Proximal
 from khop_env.physics import did_you_mean
 from khop_env.scenarios.convoy import convoy
@@ -19,22 +20,27 @@ from khop_env.scenarios.mixed_fleet import mixed_fleet
 from khop_env.scenarios.paper import paper
 from khop_env.scenarios.random_geometric import random_geometric
 from khop_env.scenarios.scenario import Scenario
+from khop_env.tasks import Task
 
 if TYPE_CHECKING:
+    from pettingzoo import AECEnv
+
     from khop_env.env.sb3 import KHopSB3VecEnv
 
 ScenarioFactory = Callable[..., Scenario]
 """A function that makes a scenario; the parameters of a family are int, float, bool or str, with defaults."""
+
+Environment: TypeAlias = str | Task | type[Task]
+"""An environment's name, or a task: an object, or a class that is made with the task's arguments."""
 
 SCENARIOS: dict[str, ScenarioFactory] = {
     factory.__name__: factory for factory in (paper, convoy, mixed_fleet, random_geometric)
 }
 """Every scenario of the library: the module `khop_env/scenarios/<name>.py` and its function of the same name."""
 
-ENVIRONMENTS = ("consensus_v0", "formation_v0", "leader_following_v0")
-"""Every environment of the library: the modules `khop_env/<name>.py`."""
-
 _TRUTH = {"true": True, "false": False}
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def scenarios() -> tuple[str, ...]:
@@ -44,99 +50,192 @@ def scenarios() -> tuple[str, ...]:
 
 def environments() -> tuple[str, ...]:
     """The names of all environments."""
-    return ENVIRONMENTS
+    return tuple(ENVIRONMENTS)
 
 
-def make_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopVectorEnv:
-    """A Gymnasium vector environment over the batched simulator.
-
-    Args:
-        environment: one of `environments()`.
-        num_envs: copies B; with N agents the vector environment has B * N rows.
-        arguments: those of the environment's `parallel_env`, without render_mode.
+def task_class(environment: str) -> type[Task]:
+    """The task that an environment plays.
 
     Raises:
-        ValueError: for an unknown environment or scenario, naming the nearest, or a wrong argument.
+        ValueError: for an unknown environment; the message suggests the closest name.
     """
-    return KHopVectorEnv(environment_module(environment).batched_env(num_envs=num_envs, **arguments), name=environment)
+    if environment not in ENVIRONMENTS:
+        raise ValueError(f"no environment {environment!r}; {did_you_mean(environment, ENVIRONMENTS)}")
+    found: type[Task] = getattr(khop_env.tasks, ENVIRONMENTS[environment])
+    return found
 
 
-def make_sb3_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopSB3VecEnv:
-    """A Stable-Baselines3 VecEnv over the batched simulator, one sub-environment per agent and copy.
-
-    Args:
-        environment: one of `environments()`.
-        num_envs: copies B.
-        arguments: as for `make_vec`.
-
-    Raises:
-        ImportError: without Stable-Baselines3.
-        ValueError: as `make_vec`.
-    """
-    module = environment_module(environment)
-    try:
-        from khop_env.env.sb3 import KHopSB3VecEnv
-    except ImportError as error:
-        raise ImportError("make_sb3_vec needs Stable-Baselines3: pip install 'khop_env[rl]'") from error
-    return KHopSB3VecEnv(module.batched_env(num_envs=num_envs, **arguments))
-
-
-def make_joint(environment: str, render_mode: str | None = None, **arguments: Any) -> JointEnv:
-    """The centralised single-agent view, which `gymnasium.make("khop/Consensus-v0")` gives.
-
-    Args:
-        environment: one of `environments()`.
-        render_mode: None, "human" or "rgb_array".
-        arguments: those of the environment's `parallel_env`.
-
-    Raises:
-        ValueError: as `make_vec`.
-    """
-    return JointEnv(environment_module(environment).parallel_env(render_mode=render_mode, **arguments))
-
-
-def assemble(
-    scenario_or_name: Scenario | str | Path,
-    task: Callable[[Scenario], Task],
-    num_envs: int,
-    arguments: dict[str, Any],
-    others: Sequence[str] = (),
+def make_batched(
+    environment: Environment, scenario: Scenario | str | Path | None = None, *, num_envs: int = 1, **arguments: Any
 ) -> BatchedEnv:
-    """The environment of a scenario and a task: what the `*_v0` modules call.
+    """Copies of an environment as arrays (copies, agents, ...).
 
     Args:
-        scenario_or_name: a scenario, or what `scenario` takes.
-        task: makes the task of the scenario's fleet and graphs.
+        environment: one of `environments()`, or a task of your own.
+        scenario: a scenario, or what `scenario` takes; the task's default if left out.
         num_envs: copies B.
-        arguments: of `Settings`, by name.
-        others: the arguments of the environment's own.
+        arguments: of `Settings`, and of the task unless it is an object, by name.
 
     Raises:
-        TypeError: for an argument that there isn't, naming the nearest.
-        ValueError: for a wrong one.
+        TypeError: for an unknown argument; the message suggests the closest one.
+        ValueError: for an unknown environment or scenario, or a wrong argument.
     """
+    task = task_class(environment) if isinstance(environment, str) else environment
+    if not (isinstance(task, Task) or (isinstance(task, type) and issubclass(task, Task))):
+        raise TypeError(f"expected an environment's name or a Task; got {environment!r} ({type(environment).__name__})")
     if "render_mode" in arguments:
         raise TypeError(
             f"batches aren't rendered, and take no render_mode; got {arguments['render_mode']!r}: give it to the "
             "environment's parallel_env, which is one copy"
         )
-    settings = Settings.of(arguments, ("scenario", "num_envs", "render_mode", *others))
+    of_settings = [field.name for field in dataclasses.fields(Settings)]
+    of_task = list(_task_parameters(task)) if isinstance(task, type) else []
+    for name in arguments:
+        if name not in (*of_settings, *of_task):
+            known = [*of_task, *of_settings, "scenario", "num_envs", "render_mode"]
+            raise TypeError(f"no argument {name!r}; {did_you_mean(name, known)}")
+    settings = Settings(**{name: value for name, value in arguments.items() if name in of_settings})
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ValueError(f"num_envs must be a positive integer; got {num_envs!r}")
-    chosen = scenario_or_name if isinstance(scenario_or_name, Scenario) else scenario(scenario_or_name)
+    chosen = _chosen_scenario(task.default_scenario if scenario is None else scenario)
+    if isinstance(task, type):
+        task = task(**{name: value for name, value in arguments.items() if name in of_task})
     simulator = chosen.build(observers=Proximal(settings.order, settings.threads), num_envs=int(num_envs))
-    return BatchedEnv(simulator, task(chosen), settings, chosen.name)
+    return BatchedEnv(simulator, task, settings, chosen.name)
 
 
-def environment_module(environment: str) -> ModuleType:
-    """The module of an environment, which has `parallel_env`, `batched_env` and `env`.
+def make(
+    environment: Environment,
+    scenario: Scenario | str | Path | None = None,
+    *,
+    render_mode: str | None = None,
+    **arguments: Any,
+) -> KHopEnv:
+    """The PettingZoo ParallelEnv of an environment, or of a task of your own.
+
+    Args:
+        environment: one of `environments()`, or a task of your own.
+        scenario: a scenario, or what `scenario` takes; the task's default if left out.
+        render_mode: None, "human" or "rgb_array".
+        arguments: as for `make_batched`.
 
     Raises:
-        ValueError: for an unknown environment, naming the nearest.
+        TypeError: as `make_batched`.
+        ValueError: as `make_batched`, or for an unknown render mode.
     """
-    if environment not in ENVIRONMENTS:
-        raise ValueError(f"no environment {environment!r}; {did_you_mean(environment, ENVIRONMENTS)}")
-    return importlib.import_module(f"khop_env.{environment}")
+    batched = make_batched(environment, scenario, **arguments)
+    return KHopEnv(batched, name=batched.task.environment, render_mode=render_mode)
+
+
+def make_aec(
+    environment: Environment,
+    scenario: Scenario | str | Path | None = None,
+    *,
+    render_mode: str | None = None,
+    **arguments: Any,
+) -> AECEnv:
+    """The same as a PettingZoo AECEnv, by PettingZoo's own conversion.
+
+    Args:
+        environment: as for `make`.
+        scenario: as for `make`.
+        render_mode: as for `make`.
+        arguments: as for `make`.
+
+    Raises:
+        TypeError: as `make`.
+        ValueError: as `make`.
+    """
+    from pettingzoo.utils import parallel_to_aec
+
+    return parallel_to_aec(make(environment, scenario, render_mode=render_mode, **arguments))
+
+
+def make_vec(environment: Environment, num_envs: int = 1, **arguments: Any) -> KHopVectorEnv:
+    """A Gymnasium vector environment over the batched simulator.
+
+    Args:
+        environment: one of `environments()`, or a task of your own.
+        num_envs: copies B; with N agents the vector environment has B * N rows.
+        arguments: those of `make`, without render_mode.
+
+    Raises:
+        TypeError: as `make`.
+        ValueError: as `make`.
+    """
+    batched = make_batched(environment, num_envs=num_envs, **arguments)
+    return KHopVectorEnv(batched, name=batched.task.environment)
+
+
+def make_sb3_vec(environment: Environment, num_envs: int = 1, **arguments: Any) -> KHopSB3VecEnv:
+    """A Stable-Baselines3 VecEnv over the batched simulator, one sub-environment per agent and copy.
+
+    Args:
+        environment: one of `environments()`, or a task of your own.
+        num_envs: copies B.
+        arguments: as for `make_vec`.
+
+    Raises:
+        ImportError: without Stable-Baselines3.
+        TypeError: as `make_vec`.
+        ValueError: as `make_vec`.
+    """
+    try:
+        from khop_env.env.sb3 import KHopSB3VecEnv
+    except ImportError as error:
+        raise ImportError("make_sb3_vec needs Stable-Baselines3: pip install 'khop_env[rl]'") from error
+    return KHopSB3VecEnv(make_batched(environment, num_envs=num_envs, **arguments))
+
+
+def make_joint(environment: Environment, render_mode: str | None = None, **arguments: Any) -> JointEnv:
+    """The centralised single-agent view, which `gymnasium.make("khop/Consensus-v0")` gives.
+
+    Args:
+        environment: one of `environments()`, or a task of your own.
+        render_mode: None, "human" or "rgb_array".
+        arguments: as for `make`.
+
+    Raises:
+        TypeError: as `make`.
+        ValueError: as `make`.
+    """
+    return JointEnv(make(environment, render_mode=render_mode, **arguments))
+
+
+def spelled_out(task: type[Task]) -> Callable[[Function], Function]:
+    """Show the arguments of settings and task in the signature of a function that takes them as keywords.
+
+    Args:
+        task: the environment's.
+    """
+
+    def decorate(function: Function) -> Function:
+        signature = inspect.signature(function)
+        fixed = [each for each in signature.parameters.values() if each.kind is not inspect.Parameter.VAR_KEYWORD]
+        hints = get_type_hints(Settings) | get_type_hints(task)
+        keywords = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
+            for name, default in {**_task_parameters(task), **_defaults(Settings)}.items()
+        ]
+        function.__signature__ = signature.replace(parameters=[*fixed, *keywords])  # type: ignore[attr-defined]
+        return function
+
+    return decorate
+
+
+def _task_parameters(task: type[Task]) -> dict[str, Any]:
+    """Names and defaults of a task's arguments."""
+    parameters = inspect.signature(task).parameters.values()
+    kinds = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    return {each.name: each.default for each in parameters if each.kind in kinds}
+
+
+def _defaults(settings: type[Settings]) -> dict[str, Any]:
+    return {field.name: field.default for field in dataclasses.fields(settings)}
+
+
+def _chosen_scenario(scenario_or_name: Scenario | str | Path) -> Scenario:
+    return scenario_or_name if isinstance(scenario_or_name, Scenario) else scenario(scenario_or_name)
 
 
 def describe() -> list[dict[str, Any]]:
@@ -145,7 +244,7 @@ def describe() -> list[dict[str, Any]]:
         {
             "name": name,
             "description": (inspect.getdoc(factory) or "").partition("\n")[0],
-            "parameters": {key: one.default for key, one in inspect.signature(factory).parameters.items()},
+            "parameters": {key: each.default for key, each in inspect.signature(factory).parameters.items()},
         }
         for name, factory in SCENARIOS.items()
     ]

@@ -14,7 +14,7 @@ from agents.learning.scaling import MOST, ObservationScaler
 from khop_env.env import BatchedEnv
 from khop_env.env.layout import Float32Array
 from khop_env.env.sb3 import KHopSB3VecEnv
-from khop_env.registry import environment_module
+from khop_env.registry import make_batched
 
 
 def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
@@ -29,20 +29,18 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
     """
     where = {} if config.scenario is None else {"scenario": config.scenario}
     count = config.num_envs if num_envs is None else num_envs
-    make = environment_module(config.environment).batched_env
-    env: BatchedEnv = make(**where, num_envs=count, observe=config.observe, bounds=config.bounds)
-    return env
+    return make_batched(config.environment, **where, num_envs=count, observe=config.observe, bounds=config.bounds)
 
 
 class TrainingVecEnv(VecEnvWrapper):
-    """Makes features of observations, and rewards linear in task errors beyond `huber`, so that few don't dominate.
+    """Makes features of observations, and rewards in which rare large errors don't dominate (`Task.robust_reward`).
 
     Copies begin at different times of their first episodes, so that not all of them end together.
 
     Args:
         venv: the environment.
         scaler: makes the features.
-        huber: in m.
+        huber: error from which rewards grow linearly only, in the unit of the task error.
     """
 
     def __init__(self, venv: KHopSB3VecEnv, scaler: ObservationScaler, huber: float) -> None:
@@ -62,9 +60,8 @@ class TrainingVecEnv(VecEnvWrapper):
         """Advance and shape."""
         observations, reward, done, infos = self.venv.step_wait()
         seen, before = np.asarray(observations), self.before
-        error = self.source.infos["task_error"].reshape(-1)
-        excess = np.maximum(error - self._huber, 0.0)  # error^2 - huber(error) = excess^2
-        reward = reward + (self.batched.settings.control_period * excess * excess).astype(np.float32)
+        by_copy = np.asarray(reward).reshape(self.batched.num_envs, -1)
+        softened = self.batched.task.robust_reward(by_copy, self.source.infos, self._huber)
         rows = np.flatnonzero(done)
         if rows.size:
             last = self.scaler(np.stack([infos[row]["terminal_observation"] for row in rows]), before[rows])
@@ -73,7 +70,7 @@ class TrainingVecEnv(VecEnvWrapper):
             before = before.copy()
             before[rows] = seen[rows]  # a new episode: nothing has changed yet
         self.before = seen
-        return self.scaler(seen, before), reward, done, infos
+        return self.scaler(seen, before), softened.reshape(-1).astype(np.float32), done, infos
 
 
 def training_environment(config: TrainingConfig) -> VecNormalize:

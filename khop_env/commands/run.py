@@ -20,7 +20,7 @@ from khop_env.commands.common import (
 from khop_env.terminal import Progress, say, waiting
 
 if TYPE_CHECKING:
-    from khop_env.env import Task
+    from khop_env.env import BatchedEnv
     from khop_env.results import Recording
     from khop_env.scenarios import LawChoice, Scenario
 
@@ -74,7 +74,7 @@ def run(
     from agents.running import policy_run
     from khop_env.observers import Explicit, Proximal
     from khop_env.results import RunFileError, record, summarize, write_run
-    from khop_env.results.metrics import task_error
+    from khop_env.results.metrics import finite
 
     explicit = integrator is IntegratorOption.EXPLICIT
     with mistakes(name), waiting(f"designing the observers of {name}"):
@@ -92,14 +92,15 @@ def run(
             if not 0.0 < value < float("inf"):
                 raise ValueError(f"{option} must be positive and finite; got {value!r}")
         simulator: Any
+        played: BatchedEnv | None = None
         if learned:
             simulator = policy_run(str(controller), scenario, observe.value, duration, seed)
             played = simulator.env.batched
-            task, dt, stepper = played.task, played.settings.control_period, simulator.observers
+            dt, stepper = played.settings.control_period, simulator.observers
             duration = simulator.duration
         else:
             law = _law(scenario, controller)
-            controller, task = law.name, None
+            controller = law.name
             stepper = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
             simulator = scenario.build(law=make_law(law), observe=observe.value, observers=stepper)
             simulator.reset(seed)
@@ -107,7 +108,8 @@ def run(
         folder = out or Path("runs") / folder_name(scenario.name)
         folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost
     with Progress(f"simulating {scenario.name}") as progress:
-        recording = record(simulator, duration, dt, progress=progress)
+        error = None if played is None else simulator.task_error
+        recording = record(simulator, duration, dt, task_error=error, progress=progress)
     summary = summarize(
         recording,
         scenario,
@@ -117,10 +119,10 @@ def run(
         controller=str(controller),
         observe=observe.value,
     )
-    if task is not None:
+    if played is not None and recording.task_error is not None:
         summary |= {
-            "environment": f"{task.name}_v0",
-            "final_task_error": task_error(scenario.fleet, recording.x[-1], task),
+            "environment": played.task.environment,
+            "final_task_error": finite(float(recording.task_error[-1])),
         }
     unwritten: RunFileError | None = None
     with mistakes(), waiting(f"writing {folder}"):
@@ -128,7 +130,7 @@ def run(
             files = write_run(recording, scenario, summary, folder)
         except RunFileError as error:
             files, unwritten = error.written, error
-    unfilmed = None if video is None else _write_video(recording, scenario, task, video, shown, files)
+    unfilmed = None if video is None else _write_video(recording, scenario, played, video, shown, files)
     if as_json:
         print_json({**summary, "files": {key: str(path) for key, path in files.items()}})
     else:
@@ -182,7 +184,7 @@ def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int |
 def _write_video(
     recording: Recording,
     scenario: Scenario,
-    task: Task | None,
+    env: BatchedEnv | None,
     path: Path,
     observer: int | None,
     files: dict[str, Path],
@@ -192,7 +194,7 @@ def _write_video(
 
     try:
         with Progress(f"filming {scenario.name}") as progress:
-            files["video"] = write_video(recording, scenario, path, observer=observer, task=task, progress=progress)
+            files["video"] = write_video(recording, scenario, path, observer=observer, env=env, progress=progress)
     except Exception as error:
         return f"couldn't write {path} ({str(error) or type(error).__name__})"
     return None

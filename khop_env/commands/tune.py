@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from typing import Annotated
 
@@ -30,7 +29,7 @@ def tune(
     from agents.laws import LAWS
     from agents.tuning import SEEDS, tune
     from khop_env.physics import did_you_mean
-    from khop_env.registry import environment_module, environments
+    from khop_env.registry import environments, make_batched, task_class
 
     with mistakes():
         if everything == (environment is not None) or (everything and scenario is not None):
@@ -42,13 +41,12 @@ def tune(
             if name not in LAWS:
                 raise ValueError(f"no law {name!r}; {did_you_mean(name, LAWS)}")
         modes = [mode.strip() for mode in observe.split(",")]
-        modules = {one: environment_module(one) for one in (environments() if everything else [str(environment)])}
+        tasks = {name: task_class(name) for name in (environments() if everything else [str(environment)])}
         call = "--all" if everything else " ".join(filter(None, [environment, scenario and f"--scenario {scenario}"]))
         lines = [f"# Found by khop tune {call}, on {len(SEEDS)} episodes with seeds from {SEEDS[0]}."]
-        for one, module in modules.items():
-            default = inspect.signature(module.batched_env).parameters["scenario"].default
-            for where in SHIPPED if everything else [scenario or default]:
-                envs = [module.batched_env(where, num_envs=len(SEEDS), observe=mode) for mode in modes]
+        for one, task in tasks.items():
+            for where in SHIPPED if everything else [scenario or task.default_scenario]:
+                envs = [make_batched(one, where, num_envs=len(SEEDS), observe=mode) for mode in modes]
                 for name in names:
                     lines.append(f'\n[{one}."{envs[0].scenario}".{name}]')
                     for mode, env in zip(modes, envs, strict=True):

@@ -5,14 +5,13 @@ from khop_env.env.batched import BatchedEnv
 from khop_env.env.joint import JointEnv
 from khop_env.env.layout import Field, ObservationLayout, Slot
 from khop_env.env.parallel import KHopEnv
-from khop_env.env.settings import Settings
-from khop_env.env.state import INFO_KEYS, EnvState
-from khop_env.env.tasks import Task, consensus, formation, leader_following
+from khop_env.env.settings import Settings, SettingsArguments
+from khop_env.env.state import SHARED_INFOS, EnvState
 from khop_env.env.vector import KHopVectorEnv
 
 __all__ = [
     "ACTUATORS",
-    "INFO_KEYS",
+    "SHARED_INFOS",
     "Actuator",
     "BatchedEnv",
     "Direct",
@@ -25,10 +24,7 @@ __all__ = [
     "Lag",
     "ObservationLayout",
     "Settings",
+    "SettingsArguments",
     "SlewLimit",
     "Slot",
-    "Task",
-    "consensus",
-    "formation",
-    "leader_following",
 ]

@@ -10,16 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from khop_env.env.actions import ActionReader
 from khop_env.env.columns import ObservationColumns, global_state
-from khop_env.env.kernels import judge, read_actions
 from khop_env.env.layout import Float32Array, ObservationLayout
-from khop_env.env.leaders import LeaderRoutes
 from khop_env.env.options import seeds
+from khop_env.env.readout import Sources
 from khop_env.env.settings import Settings
-from khop_env.env.state import INFO_KEYS, EnvState, Infos, Step, signature
-from khop_env.env.tasks import Task
+from khop_env.env.state import EnvState, Infos, Step, signature
 from khop_env.observers import FloatArray, IntArray
 from khop_env.simulation import Simulator
+from khop_env.tasks import Outcome, Task, World
 
 
 class BatchedEnv:
@@ -30,53 +30,77 @@ class BatchedEnv:
     `reset(env_ids=...)` those that ended.
 
     Args:
-        simulator: B copies, without a law.
-        task: task edges and leaders.
+        simulator: B copies, without a law, built with a task graph.
+        task: who acts, rewards, when it is over, and additional columns of observations.
         settings: everything else.
         scenario: name of the scenario that it was assembled from.
 
     Attributes:
+        task: this environment's own copy, bound to the fleet.
+        world: what the task sees.
         agents: ids of the N agents that act.
-        fleet: all agents, leaders included.
+        fleet: all agents.
+        num_envs: number of copies B.
         layouts: per agent what its observation holds.
         observation_offset: (N + 1,) where each agent's columns begin in the flat observation.
         action_offset: (N + 1,) where each agent's entries begin in the flat action.
         state_fields: what `state` holds.
 
     Raises:
-        ValueError: for agents whose inputs have no limit, or a task edge to an agent more than k hops away.
+        ValueError: for acting agents whose inputs have no limit, or a task edge to an agent more than k hops away.
     """
 
     def __init__(self, simulator: Simulator, task: Task, settings: Settings, scenario: str = "") -> None:
-        self.simulator, self.task, self.settings, self.scenario = simulator, task, settings, scenario
+        self.simulator, self.settings, self.scenario = simulator, settings, scenario
         self.fleet, self.num_envs = simulator.fleet, simulator.num_envs
-        self._members = [i for i in range(len(self.fleet)) if i not in task.leaders]
-        self.agents = tuple(self.fleet.ids[i] for i in self._members)
-        observed = ObservationColumns(
+        inputs, state = np.zeros((self.fleet.m, self.num_envs)), simulator.state
+        self.world = World(
             simulator.design,
-            task,
-            self._members,
+            simulator.task_graph,
+            self.num_envs,
+            settings.control_period,
+            settings.limit,
+            t=state.t,
+            x=state.x,
+            inputs=inputs,
+        )
+        self.task = copy.deepcopy(task)
+        self.task.bind(self.world)
+        members = [int(i) for i in self.task.acting(self.world)]
+        self.agents = tuple(self.fleet.ids[i] for i in members)
+        observed = ObservationColumns(
+            self.world,
+            self.task,
+            members,
             observe=settings.observe,
             bounds=settings.bounds,
             uniform=settings.uniform,
-            limit=settings.limit,
             inputs=settings.inputs_are_states,
         )
         self.layouts: tuple[ObservationLayout, ...] = tuple(observed.layouts)
         self.observation_offset, self._read_observations = observed.offset, observed.readout
         self.state_fields, self._read_state = global_state(self.fleet, settings.limit, settings.inputs_are_states)
-        self._prepare_actions()
-        self._prepare_rewards()
-        agents = len(self._members)
-        self._routes = LeaderRoutes(self.fleet, task, self.num_envs) if task.leaders else None
-        rows = simulator.design.states.layout.rows if self._read_observations.uses_delta else 0
-        self._delta = np.zeros((rows, self.num_envs))
-        self._inputs, self._command, self._physical = (np.zeros((self.fleet.m, self.num_envs)) for _ in range(3))
-        self._cost = np.zeros((2, agents, self.num_envs))
+        self._actions = ActionReader(self.fleet, members, settings.uniform, self.num_envs)
+        self.action_offset: IntArray = self._actions.offset
+        acting = np.zeros(self.fleet.m, bool)
+        for i in members:
+            acting[self.fleet.input_slice(i)] = True
+        self._driven = np.flatnonzero(~acting)
+        self._limit = self.fleet.input_limit[:, None]
+        self._scale = np.where(np.isfinite(self._limit), self._limit, 1.0)
+        pairs = len(state.memory["estimate"]) if self._read_observations.uses_bounds else 0
+        self._sources = Sources(
+            state.x,
+            state.memory["estimate"],
+            np.zeros((pairs, self.num_envs)),
+            inputs,
+            np.zeros((self._read_observations.task_rows, self.num_envs)),
+        )
+        self._command, self._physical = np.zeros_like(inputs), np.zeros_like(inputs)
         self._cycles, self._over = np.zeros(self.num_envs, np.int64), np.ones(self.num_envs, bool)
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeded = np.zeros(self.num_envs, bool)
-        self._clipped_actions = np.zeros((self.num_envs, agents), np.int64)
+        self._clipped_actions = np.zeros((self.num_envs, len(members)), np.int64)
 
     # -- the episode ---------------------------------------------------------------------------------------------
 
@@ -92,7 +116,7 @@ class BatchedEnv:
             seed: copy b starts from seed + b, or from one seed per copy that is reset. Without a seed a copy goes on
                 drawing from the generator that it was seeded with; one that never was draws fresh entropy.
             env_ids: (R,) indices of the copies to reset; all by default.
-            initial_states: (n,) or (R, n) states of all agents, leaders included; what is nan there is drawn.
+            initial_states: (n,) or (R, n) states of all agents, those that don't act included; nan is drawn.
 
         Returns:
             Observations and infos of all copies.
@@ -102,22 +126,21 @@ class BatchedEnv:
                 or infinite; nothing has been reset then.
             DesignError: for initial states that the observers can't start from; likewise.
         """
-        which = self.simulator.env_list(env_ids)
-        chosen = seeds(seed, which)
-        generators = [self._generator(int(b), one) for b, one in zip(which, chosen, strict=True)]
+        chosen = self.simulator.env_list(env_ids)
+        chosen_seeds = seeds(seed, chosen)
+        generators = [self._generator(int(b), each) for b, each in zip(chosen, chosen_seeds, strict=True)]
         if initial_states is not None:
             initial_states = self._completed(np.asarray(initial_states, dtype=float), generators)
-        self.simulator.reset(generators, initial_states, which)
-        for b, one, generator in zip(which.tolist(), chosen, generators, strict=True):
+        self.simulator.reset(generators, initial_states, chosen)
+        for b, each, generator in zip(chosen.tolist(), chosen_seeds, generators, strict=True):
             self._generators[b] = generator
-            self._seeded[b] |= one is not None
-            if self._routes is not None:
-                self._routes.draw(b, generator, self.simulator.x[b])
-        self._inputs[:, which] = 0.0
-        self._cycles[which] = 0
-        self._over[which] = False
-        self._clipped_actions[which] = 0
-        return self._observed(self._judge()[1])
+            self._seeded[b] |= each is not None
+        self.world.inputs[:, chosen] = 0.0
+        self._cycles[chosen] = 0
+        self._over[chosen] = False
+        self._clipped_actions[chosen] = 0
+        self.task.reset(self.world, chosen, generators)
+        return self._observed(self._evaluate())
 
     def step(self, actions: ArrayLike) -> Step:
         """Advance all copies by one control period.
@@ -133,25 +156,17 @@ class BatchedEnv:
                 changed.
             SolveError: if a state becomes infinite.
         """
-        if self._over.any():
-            over = np.flatnonzero(self._over)
-            raise ValueError(
-                f"no episode is running in {len(over)} of {self.num_envs} copies, the first {over[0]}: call reset() "
-                "first"
-            )
-        self._take(actions)
+        self._require_running()
+        self._clipped_actions = self._actions.read(actions, self._command)
         self.simulator.restart_extremes()
         for number in range(self.settings.substeps):
             self._advance(number)
         self._cycles += 1
-        reward, info = self._judge()
-        terminated = np.zeros(self.num_envs, bool)
-        if self.settings.success_radius is not None:
-            terminated = info[0].max(axis=1) <= self.settings.success_radius
-        truncated = (self._cycles >= self.settings.max_cycles) & ~terminated
-        self._over = terminated | truncated
-        observations, infos = self._observed(info)
-        return observations, reward, terminated, truncated, infos
+        outcome = self._evaluate()
+        truncated = (self._cycles >= self.settings.max_cycles) & ~outcome.terminated
+        self._over = outcome.terminated | truncated
+        observations, infos = self._observed(outcome)
+        return observations, outcome.reward, outcome.terminated, truncated, infos
 
     def observations(self) -> Float32Array:
         """What the agents observe now, in new memory."""
@@ -163,25 +178,22 @@ class BatchedEnv:
         return self._over.copy()
 
     def task_errors(self) -> FloatArray:
-        """(B, N) each agent's root mean square error along its task edges now, in m."""
-        return self._judge()[1][0]
+        """(B, N) each agent's task error now, in the task's unit."""
+        return self._evaluate().infos["task_error"]
 
     def state(self) -> Float32Array:
         """(B, S) the true global state, `state_fields` by name, in new memory."""
-        simulator, uncounted = self.simulator, np.zeros((self.num_envs, 1), np.int64)
-        return self._read_state(
-            simulator.state.x, simulator.state.memory["estimate"], self._delta, self._inputs, uncounted
-        )
+        return self._read_state(self._sources, np.zeros((self.num_envs, 1), np.int64))
 
     def get_state(self) -> EnvState:
         """A copy of everything that the next steps depend on, generators included."""
         return EnvState(
             self.simulator.save(),
-            self._inputs.copy(),
+            self.world.inputs.copy(),
             self._cycles.copy(),
             self._over.copy(),
             self._signature,
-            () if self._routes is None else (self._routes.drawn.copy(), self._routes.start.copy()),
+            {name: values.copy() for name, values in self.task.memory.items()},
             copy.deepcopy(self._generators),
             self._seeded.copy(),
         )
@@ -200,131 +212,76 @@ class BatchedEnv:
             )
         state.require_of(self._signature)
         self.simulator.restore(state.simulator)
-        self._inputs[...] = state.inputs
+        self.world.inputs[...] = state.inputs
         self._cycles, self._over, self._seeded = state.cycles.copy(), state.over.copy(), state.seeded.copy()
         self._generators = copy.deepcopy(state.generators)
-        if self._routes is not None:
-            self._routes.drawn, self._routes.start = (one.copy() for one in state.routes)
+        for name, values in state.task.items():
+            self.task.memory[name][...] = values
 
     # -- parts ---------------------------------------------------------------------------------------------------
 
     @functools.cached_property
     def _signature(self) -> dict[str, tuple[str, ...]]:
-        return signature(self.fleet, self.task, self.settings.actuator)  # type: ignore[arg-type]
+        return signature(self.task, self.world, self.settings)
 
     def _generator(self, b: int, seed: int | None) -> np.random.Generator:
-        mine = self._generators[b]
-        if seed is not None or mine is None or not self._seeded[b]:
+        own = self._generators[b]
+        if seed is not None or own is None or not self._seeded[b]:  # an unseeded copy mustn't repeat what it inherited
             return np.random.default_rng(seed)
-        return mine
+        return own
 
     def _completed(self, x0: FloatArray, generators: Sequence[np.random.Generator]) -> FloatArray:
         """Initial states with what the simulator would draw in place of nan."""
         if not np.isnan(x0).any() or x0.shape[-1:] != (self.fleet.n,):
             return x0
-        drawn = np.array([self.simulator.initial.draw(copy.deepcopy(one)) for one in generators])
+        drawn = np.array([self.simulator.initial.draw(copy.deepcopy(each)) for each in generators])
         return np.where(np.isnan(x0), drawn, x0)
 
-    def _prepare_actions(self) -> None:
-        """Which entry of the flat action is which input."""
-        fleet, models = self.fleet, [self.fleet.models[i] for i in self._members]
-        unlimited = [
-            name for name, model in zip(self.agents, models, strict=True) if not np.isfinite(model.input_limit).all()
-        ]
-        if unlimited:
+    def _require_running(self) -> None:
+        if self._over.any():
+            over = np.flatnonzero(self._over)
             raise ValueError(
-                f"actions are fractions of the input limits, and {', '.join(unlimited[:4])} has none: give its model "
-                "an input_limit"
+                f"no episode is running in {len(over)} of {self.num_envs} copies, the first {over[0]}: call reset() "
+                "first"
             )
-        sizes = np.array([model.m for model in models])
-        shown = np.full(len(sizes), sizes.max()) if self.settings.uniform else sizes
-        self.action_offset: IntArray = np.concatenate([[0], np.cumsum(shown)])
-        parts = [(number, c) for number, size in enumerate(sizes) for c in range(size)]
-        self._action_owner = np.array([number for number, _ in parts], np.int64)
-        self._action_entry = np.array([self.action_offset[number] + c for number, c in parts], np.int64)
-        offset = fleet.input_offset[self._members]
-        self._action_column = np.array([offset[number] + c for number, c in parts], np.int64)
-        self._input_owner = np.full(fleet.m, -1, np.int64)
-        self._input_owner[self._action_column] = self._action_owner
-        self._led = np.flatnonzero(self._input_owner < 0)
-        self._input_limit = fleet.input_limit[:, None]
-        self._scale = np.where(np.isfinite(self._input_limit), self._input_limit, 1.0)
-
-    def _prepare_rewards(self) -> None:
-        """Whose edge it is and where its two positions are; edges of leaders don't count."""
-        number = {i: place for place, i in enumerate(self._members)}
-        mine = np.array([i in number for i in self.task.edges[:, 0].tolist()], bool)
-        edges, position = self.task.edges[mine], self.fleet.position_index
-        owner = np.array([number[i] for i in edges[:, 0].tolist()], np.int64)
-        count = np.bincount(owner, minlength=len(self._members))
-        self._edges = (
-            owner,
-            np.ascontiguousarray(position[edges[:, 0]]),
-            np.ascontiguousarray(position[edges[:, 1]]),
-            np.ascontiguousarray(self.task.displacement[mine]),
-            1.0 / count[owner],
-        )
-
-    def _take(self, actions: ArrayLike) -> None:
-        """Write actions into the commands, or refuse them and change nothing."""
-        given = np.asarray(actions)
-        width = int(self.action_offset[-1])
-        shapes: list[tuple[int, ...]] = [(self.num_envs, width)]
-        if self.settings.uniform:
-            shapes.insert(0, (self.num_envs, len(self.agents), width // len(self.agents)))
-        if given.shape not in shapes or given.dtype.kind not in "fiu":
-            raise ValueError(f"actions must be numbers of shape {shapes[0]}; got {given.dtype} of shape {given.shape}")
-        flat = np.ascontiguousarray(given.reshape(self.num_envs, width), np.float64)
-        clipped = np.zeros_like(self._clipped_actions)
-        bad = read_actions(flat, self._action_entry, self._action_column, self._action_owner, self._command, clipped)
-        if bad >= 0:
-            env, entry = divmod(bad, len(self._action_entry))
-            owner = self._action_owner[entry]
-            where = f" in copy {env}" if self.num_envs > 1 else ""
-            raise ValueError(
-                f"the action of {self.agents[owner]!r}{where} isn't finite: entry "
-                f"{self._action_entry[entry] - self.action_offset[owner]} is {flat[env, self._action_entry[entry]]}"
-            )
-        self._clipped_actions = clipped
 
     def _advance(self, number: int) -> None:
         """One simulator step of the control period."""
-        settings, simulator = self.settings, self.simulator
+        settings, inputs = self.settings, self.world.inputs
         dt = settings.control_period / settings.substeps
-        self._inputs[...] = settings.actuator(self._command.T, self._inputs.T, dt, number, settings.substeps).T  # type: ignore[operator]
-        np.multiply(self._inputs, self._scale, out=self._physical)
-        if self._routes is not None:
-            self._routes.command(simulator.t, simulator.x, self._physical.T)
-            self._inputs[self._led] = self._physical[self._led] / self._input_limit[self._led]
-        simulator.step(dt, self._physical.T)
+        inputs[...] = settings.actuator(self._command.T, inputs.T, dt, number, settings.substeps).T  # type: ignore[operator]
+        np.multiply(inputs, self._scale, out=self._physical)
+        if self._driven.size:
+            self.task.drive(self.world, self._physical)
+            inputs[self._driven] = self._physical[self._driven] / self._limit[self._driven]
+        self.simulator.hold(self._physical)
+        self.simulator.advance(dt)
 
-    def _judge(self) -> tuple[FloatArray, FloatArray]:
-        """Rewards (B, N), and the first three infos (3, B, N)."""
-        settings = self.settings
-        simulator, shape = self.simulator, (self.num_envs, len(self.agents))
-        reward, info = np.empty(shape), np.empty((3, *shape))
-        scale = settings.control_period, float(settings.effort)
-        seen = simulator.extremes
-        ratios = seen.normalized, seen.relative, seen.input_normalized, seen.input_relative
-        judge(*self._edges, simulator.state.x, self._input_owner, self._inputs, scale, ratios, self._cost, reward, info)
-        if settings.reward == "team":
-            reward[...] = reward.mean(axis=1, keepdims=True)
-        return reward, info
+    def _evaluate(self) -> Outcome:
+        return self.task.evaluate(self.world)
 
     def _observe(self) -> tuple[Float32Array, IntArray]:
         """Observations, and how many entries of each agent's were clipped."""
-        simulator = self.simulator
-        clipped = np.zeros((self.num_envs, len(self.agents)), np.int64)
-        if len(self._delta):
-            simulator.design.states.delta.evaluate(simulator.t, self._delta)
-        flat = self._read_observations(
-            simulator.state.x, simulator.state.memory["estimate"], self._delta, self._inputs, clipped
-        )
+        sources, clipped = self._sources, np.zeros((self.num_envs, len(self.agents)), np.int64)
+        if sources.bound.size:
+            self.simulator.observers.bound(self.simulator.state, sources.bound)
+        if sources.task.size:
+            self.task.observe(self.world, sources.task)
+        flat = self._read_observations(sources, clipped)
         if self.settings.uniform:
             return flat.reshape(self.num_envs, len(self.agents), -1), clipped
         return flat, clipped
 
-    def _observed(self, info: FloatArray) -> tuple[Float32Array, Infos]:
+    def _observed(self, outcome: Outcome) -> tuple[Float32Array, Infos]:
         observations, clipped = self._observe()
-        values = (*info, clipped, self._clipped_actions.copy())
-        return observations, dict(zip(INFO_KEYS, values, strict=True))
+        seen, shape = self.simulator.extremes, (self.num_envs, len(self.agents))
+        ratios = {
+            "max_normalized_disagreement": np.maximum(seen.normalized, seen.input_normalized),
+            "max_error_to_bound": np.maximum(seen.relative, seen.input_relative),
+        }
+        return observations, {
+            **outcome.infos,
+            **{name: np.broadcast_to(values[:, None], shape).copy() for name, values in ratios.items()},
+            "clipped_observations": clipped,
+            "clipped_actions": self._clipped_actions.copy(),
+        }

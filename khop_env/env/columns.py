@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from khop_env.env.layout import Feature, Field, ObservationLayout, Slot, axis_names, features, slots_of
+from khop_env.env.layout import Feature, Field, ObservationLayout, Slot, features, slots_of
 from khop_env.env.readout import (
-    DELTA,
+    BOUND,
     ESTIMATE,
     ESTIMATE_COS,
     ESTIMATE_RELATIVE,
@@ -18,29 +18,31 @@ from khop_env.env.readout import (
     STATE_COS,
     STATE_RELATIVE,
     STATE_SIN,
+    TASK,
     Column,
     Readout,
 )
-from khop_env.env.tasks import Task
-from khop_env.observers import IntArray, ObserverDesign
+from khop_env.observers import IntArray
 from khop_env.physics import Fleet
 from khop_env.simulation import Observe
+from khop_env.tasks import Column as TaskColumn
+from khop_env.tasks import Task, World
+from khop_env.tasks.edges import axis_names
 
 _STATE = {"value": STATE, "cos": STATE_COS, "sin": STATE_SIN}
 _ESTIMATE = {"value": ESTIMATE, "cos": ESTIMATE_COS, "sin": ESTIMATE_SIN}
 
 
 class ObservationColumns:
-    """The observations of a task's agents.
+    """The observations of the agents that act.
 
     Args:
-        design: who hears and estimates whom.
-        task: task edges and leaders.
+        world: fleet and observers.
+        task: bound; its edges order the slots, and it adds columns of its own.
         agents: the agents that observe, by index.
         observe: what stands in the slots of agents out of earshot: their estimate, the truth, or nothing.
         bounds: whether slots hold the guaranteed bound on the estimate's error.
         uniform: the same columns for every agent, padded; or exactly what each agent has.
-        limit: bound on positions and other states, in their own units.
         inputs: whether an agent sees its input in force: where an actuator makes it a state of its own.
 
     Attributes:
@@ -51,34 +53,33 @@ class ObservationColumns:
 
     def __init__(
         self,
-        design: ObserverDesign,
+        world: World,
         task: Task,
         agents: Sequence[int],
         *,
         observe: Observe,
         bounds: bool,
         uniform: bool,
-        limit: float,
         inputs: bool,
     ) -> None:
-        self._design, self._fleet, self._observe = design, design.fleet, observe
-        self._bounds, self._uniform, self._limit, self._inputs = bounds, uniform, limit, inputs
+        design = world.design
+        self._world, self._task, self._design, self._fleet, self._observe = world, task, design, design.fleet, observe
+        self._bounds, self._uniform, self._limit, self._inputs = bounds, uniform, world.limit, inputs
         models = self._fleet.models
         self._types = list(dict.fromkeys(model.type for model in models))
         self._axes = axis_names(self._fleet.position_dim)
         self._most_rest = max(len(features(model)[1]) for model in models)
         self._most_states, self._most_inputs = max(model.n for model in models), max(model.m for model in models)
-        self._delta_row = {int(source): row for row, source in enumerate(design.states.layout.row_source)}
         start = design.states.delta.evaluate(np.zeros(1), np.empty((design.states.layout.rows, 1)))
-        self._largest_bound = max(limit, float(start.max(initial=0.0)))
-        self._reach = max(limit, float(np.abs(task.displacement).max(initial=0.0)))
+        self._largest_bound = max(world.limit, float(start.max(initial=0.0)))
 
-        slots = slots_of(design, task, agents)
+        slots = slots_of(design, task.edges, agents)
         columns = [
             self._own(i) + [one for number, slot in enumerate(mine) for one in self._slot(i, number, slot)]
             for i, mine in zip(agents, slots, strict=True)
         ]
         if uniform:
+            self._require_equal_counts(agents)
             columns = self._padded(columns, [len(mine) for mine in slots])
         self.layouts = [
             ObservationLayout(self._fleet.ids[i], [one.field for one in mine], its_slots)
@@ -100,7 +101,19 @@ class ObservationColumns:
                 for c, name in enumerate(model.inputs)
             ]
             columns += self._padding("own.input", self._most_inputs - model.m)
-        return columns + self._type("own", model.type)
+        columns += self._type("own", model.type)
+        return columns + [_from_task("", column) for column in self._task.columns(self._world, i)]
+
+    def _require_equal_counts(self, agents: Sequence[int]) -> None:
+        """Refuse a task that shows its agents different numbers of columns, where observations are uniform."""
+        counts = {self._fleet.ids[i]: len(self._task.columns(self._world, i)) for i in agents}
+        if len(set(counts.values())) > 1:
+            few, many = min(counts, key=counts.__getitem__), max(counts, key=counts.__getitem__)
+            raise ValueError(
+                f"task {self._task.name!r}: uniform observations need as many columns for every agent, and columns() "
+                f"gives {few!r} {counts[few]} and {many!r} {counts[many]}; pad them, or make the environment with "
+                "uniform=False"
+            )
 
     def _slot(self, i: int, number: int, slot: Slot) -> list[Column]:
         fleet, name, model = self._fleet, f"slot{number}", self._fleet.models[slot.agent]
@@ -111,10 +124,7 @@ class ObservationColumns:
             _flag(f"{name}.task_edge", slot.task_edge),
             *(self._type(name, model.type) if len(self._types) > 1 else ()),
         ]
-        columns += [
-            Column(Field(f"{name}.displacement.{axis}", "m", -self._reach, self._reach), value=float(value))
-            for axis, value in zip(self._axes, slot.displacement, strict=True)
-        ]
+        columns += [_from_task(f"{name}.", column) for column in self._task.slot_columns(self._world, i, slot.agent)]
         estimated = not slot.heard and self._observe == "estimate"
         origin = int(fleet.state_offset[slot.agent])
         if estimated:
@@ -135,20 +145,23 @@ class ObservationColumns:
         ]
         columns += self._padding(name, self._most_rest - len(rest))
         if self._bounds:
-            columns += self._bound_columns(name, slot)
+            columns += self._bound_columns(i, name, slot)
         if self._observe == "local" and not slot.heard:
             return [Column(one.field) for one in columns]
         return columns
 
-    def _bound_columns(self, name: str, slot: Slot) -> list[Column]:
+    def _bound_columns(self, i: int, name: str, slot: Slot) -> list[Column]:
         """Bounds in the order of the state: position, then the rest; heard agents have no error."""
-        model, first = self._fleet.models[slot.agent], int(self._fleet.state_offset[slot.agent])
+        model = self._fleet.models[slot.agent]
         states, position = list(model.states.items()), model.position_index.tolist()
         columns = []
         for component in [*position, *(c for c in range(model.n) if c not in position)]:
             state, unit = states[component]
             field = Field(f"{name}.bound.{state}", unit, 0.0, self._largest_bound)
-            columns.append(Column(field) if slot.heard else Column(field, DELTA, self._delta_row[first + component]))
+            if slot.heard:
+                columns.append(Column(field))
+            else:
+                columns.append(Column(field, BOUND, self._design.states.layout.slot[i, slot.agent] + component))
         return columns + self._padding(f"{name}.bound", self._most_states - model.n)
 
     def _type(self, name: str, kind: str) -> list[Column]:
@@ -169,7 +182,7 @@ class ObservationColumns:
         high = np.max([[one.field.high for one in mine] for mine in columns], axis=0)
         return [
             [
-                Column(Field(one.field.name, one.field.unit, a, b), one.kind, one.a, one.b, one.value)
+                Column(Field(one.field.name, one.field.unit, a, b), one.kind, one.row, one.origin, one.value)
                 for one, a, b in zip(mine, low.tolist(), high.tolist(), strict=True)
             ]
             for mine in columns
@@ -197,6 +210,11 @@ def global_state(fleet: Fleet, limit: float, inputs: bool) -> tuple[list[Field],
 def _state(name: str, feature: Feature, kind: int, origin: int, limit: float) -> Column:
     limit = limit if feature.how == "value" else 1.0
     return Column(Field(f"{name}.{feature.name}", feature.unit, -limit, limit), kind, origin + feature.component)
+
+
+def _from_task(prefix: str, column: TaskColumn) -> Column:
+    field = Field(f"{prefix}{column.name}", column.unit, column.low, column.high)
+    return Column(field, value=float(column.value)) if column.row is None else Column(field, TASK, column.row)
 
 
 def _flag(name: str, value: bool) -> Column:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -13,13 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 from khop_env.env.layout import Float32Array
 from khop_env.env.options import initial_states
 from khop_env.env.parallel import RENDER_MODES, KHopEnv
-from khop_env.env.state import INFO_KEYS, Infos
+from khop_env.env.state import Infos
+
+_AGGREGATES: dict[str, Callable[..., Any]] = {
+    "max_normalized_disagreement": np.max,
+    "max_error_to_bound": np.max,
+    "clipped_observations": np.sum,
+    "clipped_actions": np.sum,
+}
+"""How a team's infos are made of its agents'; others are means."""
 
 
 class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
     """All agents' observations side by side, all their actions side by side, and the mean of their rewards.
 
-    Infos hold the team's mean task error, the largest ratios, and the sums of the clip counts.
+    Infos hold the largest ratios, the sums of the clip counts, and the means of everything else.
 
     Args:
         env: the ParallelEnv that is seen as one.
@@ -50,7 +58,8 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         batched = self.env.batched
         observations, infos = batched.reset(seed, initial_states=initial_states(batched.fleet, options))
         super().reset(seed=seed)
-        return observations.reshape(-1), self._info(infos, begins=True)
+        self.env.follow(begins=True)
+        return observations.reshape(-1), self._info(infos)
 
     def step(self, action: ArrayLike) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """Advance by one control period.
@@ -65,6 +74,7 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         if given.shape != self.action_space.shape:
             raise ValueError(f"the action must have shape {self.action_space.shape}; got {given.shape}")
         observations, reward, terminated, truncated, infos = self.env.batched.step(given[None])
+        self.env.follow()
         info = self._info(infos)
         return observations.reshape(-1), float(reward.mean()), bool(terminated[0]), bool(truncated[0]), info
 
@@ -80,9 +90,5 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         """Close the window, if there is one."""
         self.env.close()
 
-    def _info(self, infos: Infos, *, begins: bool = False) -> dict[str, Any]:
-        shown = self.env.shown(infos, begins=begins)
-        values = [np.array([one[key] for one in shown.values()]) for key in INFO_KEYS]
-        error, normalized, relative, observations, actions = values
-        team = error.mean(), normalized.max(), relative.max(), observations.sum(), actions.sum()
-        return dict(zip(INFO_KEYS, (one.item() for one in team), strict=True))
+    def _info(self, infos: Infos) -> dict[str, Any]:
+        return {name: _AGGREGATES.get(name, np.mean)(values).item() for name, values in infos.items()}

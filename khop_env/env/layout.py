@@ -13,8 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from khop_env.env.tasks import Task
-from khop_env.observers import FloatArray, ObserverDesign
+from khop_env.observers import IntArray, ObserverDesign
 from khop_env.physics import AgentModel, did_you_mean, hop_distances
 
 Float32Array = NDArray[np.float32]
@@ -46,8 +45,7 @@ class Slot:
         id: its id.
         heard: whether it is heard (1 hop), or estimated.
         hops: distance in the communication graph.
-        task_edge: whether the observing agent has a task edge to it.
-        displacement: (d,) p_j - p_i that the task asks for, in m; zeros without a task edge.
+        task_edge: whether the observing agent's task has an edge to it.
     """
 
     agent: int
@@ -55,7 +53,6 @@ class Slot:
     heard: bool
     hops: int
     task_edge: bool
-    displacement: FloatArray
 
 
 class ObservationLayout:
@@ -177,31 +174,30 @@ def features(model: AgentModel) -> tuple[list[Feature], list[Feature]]:
     return [Feature(names[component][0], names[component][1], component) for component in position], rest
 
 
-def axis_names(dim: int) -> list[str]:
-    """Names of the position's axes, common to all models."""
-    return list("xyz"[:dim]) if dim <= 3 else [f"axis{q}" for q in range(dim)]
-
-
-def slots_of(design: ObserverDesign, task: Task, agents: Sequence[int]) -> list[list[Slot]]:
+def slots_of(design: ObserverDesign, edges: IntArray, agents: Sequence[int]) -> list[list[Slot]]:
     """The slots of each of `agents`: everybody within k hops, in order of relevance.
+
+    Args:
+        design: who receives from whom, and k.
+        edges: (E, 2) task edges (i, j): j matters to i.
+        agents: the observing agents.
 
     Raises:
         ValueError: for a task edge to an agent more than k hops away.
     """
     hops = hop_distances(design.communication, design.k)
-    wanted: list[dict[int, FloatArray]] = [{} for _ in range(len(design.fleet))]
-    for (i, j), displacement in zip(task.edges.tolist(), task.displacement, strict=True):
-        wanted[i][j] = displacement
+    related: list[set[int]] = [set() for _ in range(len(design.fleet))]
+    for i, j in edges.tolist():
+        related[i].add(j)
         if j not in hops[i]:
             raise ValueError(
                 f"{design.fleet.ids[i]!r} has a task edge to {design.fleet.ids[j]!r}, which is more than "
                 f"k = {design.k} hops away, so that it knows nothing of it"
             )
-    nowhere = np.zeros(design.fleet.position_dim)
     return [
         [
-            Slot(j, design.fleet.ids[j], hops[i][j] == 1, hops[i][j], j in wanted[i], wanted[i].get(j, nowhere))
-            for j in sorted((j for j in hops[i] if j != i), key=lambda j: (j not in wanted[i], hops[i][j], j))
+            Slot(j, design.fleet.ids[j], hops[i][j] == 1, hops[i][j], j in related[i])
+            for j in sorted((j for j in hops[i] if j != i), key=lambda j: (j not in related[i], hops[i][j], j))
         ]
         for i in agents
     ]

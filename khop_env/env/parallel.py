@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import reprlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from pettingzoo import ParallelEnv
 from khop_env.env.batched import BatchedEnv
 from khop_env.env.layout import Float32Array, ObservationLayout
 from khop_env.env.options import initial_states
-from khop_env.env.state import INFO_KEYS, EnvState, Infos
+from khop_env.env.state import EnvState, Infos
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import did_you_mean
 
@@ -79,8 +80,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         if render_mode is not None:
             from khop_env.env.rendering import Renderer
 
-            task = batched.task
-            self._renderer = Renderer(batched.simulator.design, task.edges, leaders=task.leaders, title=name)
+            self._renderer = Renderer.of(batched.task, batched.world, title=name)
 
     def __repr__(self) -> str:
         return f"KHopEnv({self.metadata['name']}, {len(self.possible_agents)} agents)"
@@ -115,7 +115,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             DesignError: for initial states that the observers can't start from.
         """
         observations, infos = self.batched.reset(seed, initial_states=initial_states(self.batched.fleet, options))
-        return self._by_agent(observations), self.shown(infos, begins=True)
+        self.follow(begins=True)
+        return self._by_agent(observations), self._infos(infos)
 
     def step(self, actions: Mapping[str, Float32Array]) -> ParallelStep:
         """Advance by one control period.
@@ -129,14 +130,14 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
                 nothing has changed then.
         """
         observations, reward, terminated, truncated, infos = self.batched.step(self._flat(actions))
-        over = bool(terminated[0]), bool(truncated[0])
+        self.follow()
         agents = self.possible_agents
         return (
             self._by_agent(observations),
             dict(zip(agents, reward[0].tolist(), strict=True)),
-            dict.fromkeys(agents, over[0]),
-            dict.fromkeys(agents, over[1]),
-            self.shown(infos),
+            dict.fromkeys(agents, bool(terminated[0])),
+            dict.fromkeys(agents, bool(truncated[0])),
+            self._infos(infos),
         )
 
     def observe(self, agent: str) -> Float32Array:
@@ -183,9 +184,10 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             self._renderer.close()
 
     def _known(self, agent: str) -> str:
+        fleet = self.batched.fleet
         if agent not in self._layouts:
-            leaders = [self.batched.fleet.ids[i] for i in self.batched.task.leaders]
-            why = "it is a leader, which takes no part" if agent in leaders else did_you_mean(agent, self._layouts)
+            label = self.batched.task.driven_label
+            why = f"it is a {label}, which takes no part" if agent in fleet.ids else did_you_mean(agent, self._layouts)
             raise ValueError(f"no agent {agent!r}; {why}")
         return agent
 
@@ -220,11 +222,10 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         flat = observations.reshape(-1)
         return {agent: flat[part] for agent, part in self._columns.items()}
 
-    def shown(self, infos: Infos, *, begins: bool = False) -> dict[str, dict[str, float]]:
-        """Infos by agent, after `agents`, trails and the window have been brought up to date with `batched`.
+    def follow(self, *, begins: bool = False) -> None:
+        """Bring `agents`, trails and the window up to date with `batched`, after a reset or a step of it.
 
         Args:
-            infos: of `batched`.
             begins: whether an episode has just begun.
         """
         self._begun = True
@@ -232,8 +233,10 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self._remember(begins=begins)
         if self._renderer is not None and self.render_mode == "human":
             self._draw(self._renderer)
-        rows = zip(*(infos[key][0].tolist() for key in INFO_KEYS), strict=True)
-        return {agent: dict(zip(INFO_KEYS, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
+
+    def _infos(self, infos: Infos) -> dict[str, dict[str, float]]:
+        rows = zip(*(values[0].tolist() for values in infos.values()), strict=True)
+        return {agent: dict(zip(infos, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
 
     def _remember(self, *, begins: bool) -> None:
         """Add to the trails, or begin new ones: whoever renders seldom sees the whole path."""
@@ -244,20 +247,13 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self._renderer.remember(float(self.batched.simulator.t[0]), self.batched.simulator.x[0])
 
     def _draw(self, renderer: Renderer) -> NDArray[np.uint8] | None:
-        simulator = self.batched.simulator
-        seen = simulator.extremes
-        normalized = max(float(seen.normalized[0]), float(seen.input_normalized[0]))
-        task_error = float(self.batched.task_errors().mean())
-        scene = (
-            float(simulator.t[0]),
-            simulator.x[0],
-            simulator.estimates[0],
-            normalized,
-            task_error,
-        )
+        batched, simulator = self.batched, self.batched.simulator
+        largest, task_error = float(simulator.extremes.kept()[0]), float(batched.task_errors().mean())
+        scene = (float(simulator.t[0]), simulator.x[0], simulator.estimates[0], largest, task_error)
+        decorate = functools.partial(batched.task.draw, world=batched.world)
         if self.render_mode == "rgb_array":
-            return renderer.frame(*scene)
-        renderer.show(*scene)
+            return renderer.frame(*scene, decorate=decorate)
+        renderer.show(*scene, decorate=decorate)
         return None
 
 

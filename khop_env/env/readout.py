@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,9 +12,9 @@ from khop_env.compiled import compiled
 from khop_env.env.layout import Field, Float32Array
 from khop_env.observers import FloatArray, IntArray
 
-# what a column reads: nothing, states, estimates, bounds, inputs
+# sources of a column's value: none, states, estimates, their guaranteed bounds, inputs, the task's own rows
 CONSTANT, STATE, STATE_COS, STATE_SIN, STATE_RELATIVE = range(5)
-ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, DELTA, INPUT = range(5, 11)
+ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, BOUND, INPUT, TASK = range(5, 12)
 _TILE = 32  # environments: a column's values of so many are computed before they are written
 
 
@@ -24,105 +25,141 @@ class Column:
     Attributes:
         field: name, unit and bounds.
         kind: CONSTANT, STATE, ...
-        a: the row that it reads, of the states, estimates, bounds or inputs.
-        b: the row of the states that a relative position is taken from, or -1.
+        row: of the states, estimates, bounds, inputs or task values that it reads.
+        origin: the row of the states that a relative position is taken from, or -1.
         value: of a constant.
     """
 
     field: Field
     kind: int = CONSTANT
-    a: int = -1
-    b: int = -1
+    row: int = -1
+    origin: int = -1
     value: float = 0.0
+
+
+class Sources(NamedTuple):
+    """The arrays that observations are read from, batch last.
+
+    Attributes:
+        x: (n, B) states.
+        estimate: (P, B) estimates.
+        bound: (P, B) guaranteed bounds on their errors; not read unless `Readout.uses_bounds`.
+        inputs: (m, B) inputs in force, as fractions of their limits.
+        task: (rows, B) values of the task's live columns.
+    """
+
+    x: FloatArray
+    estimate: FloatArray
+    bound: FloatArray
+    inputs: FloatArray
+    task: FloatArray
+
+
+class _LiveColumns(NamedTuple):
+    """The columns that aren't constant, an entry each."""
+
+    column: IntArray
+    kind: IntArray
+    row: IntArray
+    origin: IntArray
+    owner: IntArray
+    low: FloatArray
+    high: FloatArray
 
 
 class Readout:
     """Fills (B, columns) vectors; every value lies within its field's bounds.
 
     Args:
-        columns: what each column is.
+        columns: in order.
         owner: per column the number of the agent whose observation it belongs to, for the counts of clipped values.
+
+    Attributes:
+        template: (columns,) the constants.
+        uses_bounds: whether any column reads guaranteed bounds.
+        task_rows: rows of the task's live columns.
     """
 
     def __init__(self, columns: Sequence[Column], owner: Sequence[int]) -> None:
-        self.template = np.array([one.value for one in columns], np.float32)
-        live = [q for q, one in enumerate(columns) if one.kind != CONSTANT]
-        self._table = np.array([[q, columns[q].kind, columns[q].a, columns[q].b, owner[q]] for q in live], np.int64)
-        self._table = self._table.reshape(-1, 5)
-        self._low = np.array([columns[q].field.low for q in live], np.float32).astype(np.float64)
-        self._high = np.array([columns[q].field.high for q in live], np.float32).astype(np.float64)
-        self.uses_delta = bool((self._table[:, 1] == DELTA).any())
+        self.template = np.array([column.value for column in columns], np.float32)
+        live = [q for q, column in enumerate(columns) if column.kind != CONSTANT]
+        kinds, rows = [columns[q].kind for q in live], [columns[q].row for q in live]
+        # float32 bounds, so that what is clipped to them in float64 is inside them as float32, too
+        low, high = (
+            np.array([getattr(columns[q].field, end) for q in live], np.float32).astype(float)
+            for end in ("low", "high")
+        )
+        self._live = _LiveColumns(
+            np.array(live, np.int64),
+            np.array(kinds, np.int64),
+            np.array(rows, np.int64),
+            np.array([columns[q].origin for q in live], np.int64),
+            np.array([owner[q] for q in live], np.int64),
+            low,
+            high,
+        )
+        self.uses_bounds = BOUND in kinds
+        self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
-    def __call__(
-        self, x: FloatArray, estimate: FloatArray, delta: FloatArray, u: FloatArray, clipped: IntArray
-    ) -> Float32Array:
-        """Vectors (B, columns), new memory, of states (n, B), estimates (P, B), bounds (rows, B) and inputs (m, B).
-
-        Adds to `clipped` (B, owners) how many values had to be brought back into their bounds.
-        """
-        out = np.empty((x.shape[1], len(self.template)), np.float32)
-        fill(self._table, self._low, self._high, self.template, x, estimate, delta, u, out, clipped)
+    def __call__(self, sources: Sources, clipped: IntArray) -> Float32Array:
+        """Vectors (B, columns) in new memory; adds to `clipped` (B, owners) how many values had to be clipped."""
+        out = np.empty((sources.x.shape[1], len(self.template)), np.float32)
+        fill(self._live, self.template, sources, out, clipped)
         return out
 
 
 @compiled
-def fill(
-    table: IntArray,
-    low: FloatArray,
-    high: FloatArray,
-    template: Float32Array,
-    x: FloatArray,
-    estimate: FloatArray,
-    delta: FloatArray,
-    u: FloatArray,
-    out: Float32Array,
-    clipped: IntArray,
-) -> None:
-    """Write `template` and the columns of `table` into `out` (B, columns); count values out of bounds per owner."""
+def fill(live: _LiveColumns, template: Float32Array, sources: Sources, out: Float32Array, clipped: IntArray) -> None:
+    """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner."""
+    x, estimate = sources.x, sources.estimate
     values = np.empty(_TILE)
     for first in range(0, out.shape[0], _TILE):
         width = min(_TILE, out.shape[0] - first)
         for e in range(width):
             out[first + e] = template
-        for q in range(table.shape[0]):
-            column, kind, a, b, owner = table[q, 0], table[q, 1], table[q, 2], table[q, 3], table[q, 4]
+        for q in range(live.column.size):
+            column, kind, row, origin, owner = live.column[q], live.kind[q], live.row[q], live.origin[q], live.owner[q]
+            low, high = live.low[q], live.high[q]
             if kind == STATE_RELATIVE:
                 for e in range(width):
-                    values[e] = x[a, first + e] - x[b, first + e]
+                    values[e] = x[row, first + e] - x[origin, first + e]
             elif kind == ESTIMATE_RELATIVE:
                 for e in range(width):
-                    values[e] = estimate[a, first + e] - x[b, first + e]
+                    values[e] = estimate[row, first + e] - x[origin, first + e]
             elif kind == STATE:
                 for e in range(width):
-                    values[e] = x[a, first + e]
+                    values[e] = x[row, first + e]
             elif kind == ESTIMATE:
                 for e in range(width):
-                    values[e] = estimate[a, first + e]
-            elif kind == DELTA:
+                    values[e] = estimate[row, first + e]
+            elif kind == BOUND:
                 for e in range(width):
-                    values[e] = delta[a, first + e]
+                    values[e] = sources.bound[row, first + e]
             elif kind == INPUT:
                 for e in range(width):
-                    values[e] = u[a, first + e]
+                    values[e] = sources.inputs[row, first + e]
+            elif kind == TASK:
+                for e in range(width):
+                    values[e] = sources.task[row, first + e]
             elif kind == STATE_COS:
                 for e in range(width):
-                    values[e] = np.cos(x[a, first + e])
+                    values[e] = np.cos(x[row, first + e])
             elif kind == STATE_SIN:
                 for e in range(width):
-                    values[e] = np.sin(x[a, first + e])
+                    values[e] = np.sin(x[row, first + e])
             elif kind == ESTIMATE_COS:
                 for e in range(width):
-                    values[e] = np.cos(estimate[a, first + e])
+                    values[e] = np.cos(estimate[row, first + e])
             else:
                 for e in range(width):
-                    values[e] = np.sin(estimate[a, first + e])
+                    values[e] = np.sin(estimate[row, first + e])
             outside = 0
             for e in range(width):
-                outside += (values[e] < low[q]) | (values[e] > high[q])
+                outside += (values[e] < low) | (values[e] > high)
             if outside:
                 for e in range(width):
-                    clipped[first + e, owner] += (values[e] < low[q]) | (values[e] > high[q])
+                    clipped[first + e, owner] += (values[e] < low) | (values[e] > high)
             for e in range(width):
-                values[e] = min(max(values[e], low[q]), high[q])
+                values[e] = min(max(values[e], low), high)
             for e in range(width):
                 out[first + e, column] = values[e]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TypedDict
 
 import numpy as np
 
@@ -14,7 +12,6 @@ from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
 from khop_env.physics import did_you_mean
 from khop_env.simulation import OBSERVE, Observe
 
-Reward = Literal["agent", "team"]
 NUMBER = (int, float, np.integer, np.floating)
 
 
@@ -33,9 +30,6 @@ class Settings:
         order: of the simulator's step, 1 or 2. Actions are held over a control period, so that the closed loop is of
             order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time.
         actuator: "direct", "lag", "slew", "hold", or an `Actuator`.
-        reward: "agent" for each agent's own, "team" for the mean of all.
-        effort: weight of the squared input (fractions of its limits), in m^2.
-        success_radius: terminate when no agent's task error exceeds it, in m; None to go on to the horizon.
         limit: bound on positions and other states in observations, in their own units; values beyond are clipped.
         threads: of the observers' solve.
 
@@ -51,9 +45,6 @@ class Settings:
     dt: float | None = None
     order: int = 1
     actuator: str | Actuator = "direct"
-    reward: Reward = "agent"
-    effort: float = 0.1
-    success_radius: float | None = None
     limit: float = 100.0
     threads: int = 1
 
@@ -63,8 +54,6 @@ class Settings:
                 f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}; "
                 f"{did_you_mean(str(self.observe), OBSERVE)}"
             )
-        if self.reward not in ("agent", "team"):
-            raise ValueError(f"reward must be 'agent' or 'team'; got {self.reward!r}")
         for name in ("bounds", "uniform"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False; got {getattr(self, name)!r}")
@@ -72,14 +61,12 @@ class Settings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"{name} must be a positive integer; got {value!r}")
-        for name in ("control_period", "dt", "success_radius", "limit"):
+        for name in ("control_period", "dt", "limit"):
             value = getattr(self, name)
-            if value is None and name in ("dt", "success_radius"):
+            if value is None and name == "dt":
                 continue
             if not isinstance(value, NUMBER) or not 0.0 < value < math.inf:
                 raise ValueError(f"{name} must be a positive, finite number; got {value!r}")
-        if not isinstance(self.effort, NUMBER) or not 0.0 <= self.effort < math.inf:
-            raise ValueError(f"effort must be finite and not negative; got {self.effort!r}")
         object.__setattr__(self, "actuator", as_actuator(self.actuator))
         substeps = self.substeps  # refuses a period that isn't a whole number of steps
         if isinstance(self.actuator, Hold) and substeps == 1:
@@ -87,23 +74,6 @@ class Settings:
                 "actuator='hold' draws a line over several simulator steps, and here a control period is one: "
                 f"give dt below control_period = {self.control_period:g} s"
             )
-
-    @classmethod
-    def of(cls, arguments: Mapping[str, Any], others: Sequence[str] = ()) -> Settings:
-        """Settings from keyword arguments.
-
-        Args:
-            arguments: by name.
-            others: arguments that the caller knows beside these, for the error.
-
-        Raises:
-            TypeError: for a name that there isn't, naming the nearest.
-        """
-        known = [one.name for one in dataclasses.fields(cls)]
-        for name in arguments:
-            if name not in known:
-                raise TypeError(f"no argument {name!r}; {did_you_mean(name, [*others, *known])}")
-        return cls(**arguments)
 
     @property
     def substeps(self) -> int:
@@ -127,3 +97,18 @@ class Settings:
     def inputs_are_states(self) -> bool:
         """Whether the actuator remembers its input, which agents have to see then."""
         return not isinstance(self.actuator, Direct)
+
+
+class SettingsArguments(TypedDict, total=False):
+    """The same as keyword arguments, for type checkers."""
+
+    observe: Observe
+    bounds: bool
+    uniform: bool
+    max_cycles: int
+    control_period: float
+    dt: float | None
+    order: int
+    actuator: str | Actuator
+    limit: float
+    threads: int

@@ -9,23 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.env.actuators import Actuator, described
+from khop_env.env.actuators import described
 from khop_env.env.layout import Float32Array
-from khop_env.env.tasks import Task
+from khop_env.env.settings import Settings
 from khop_env.observers import FloatArray, IntArray
-from khop_env.physics import Fleet
 from khop_env.simulation import SimulatorState
+from khop_env.tasks import Task, World
 
-INFO_KEYS = (
-    "task_error",
+SHARED_INFOS = (
     "max_normalized_disagreement",
     "max_error_to_bound",
     "clipped_observations",
     "clipped_actions",
 )
-"""Keys of every info: the agent's root mean square error along its task edges in m; the largest |xi| / rho and
-|x_tilde| / delta (inputs: |mu| / omega, |g_tilde| / theta) of all observers since the last action, below 1 by
-guarantee; entries of this agent's observation and action that were clipped."""
+"""Keys of every info beside the task's own: the largest |xi| / rho and |x_tilde| / delta (inputs: |mu| / omega,
+|g_tilde| / theta) of all observers since the last action, below 1 by guarantee; entries of this agent's observation and
+action that were clipped."""
 
 Infos = dict[str, NDArray[Any]]
 Step = tuple[Float32Array, FloatArray, NDArray[np.bool_], NDArray[np.bool_], Infos]
@@ -41,7 +40,7 @@ class EnvState:
         cycles: (B,) control periods since reset.
         over: (B,) whether the episode has ended, or none has begun.
         environment: what the state belongs to, as `signature` gives it.
-        routes: the leaders' draws and where they began; empty without leaders.
+        task: the task's memory, by name.
         generators: one per copy; None before the first reset.
         seeded: (B,) whether a copy was ever reset with a seed.
     """
@@ -51,7 +50,7 @@ class EnvState:
     cycles: IntArray
     over: NDArray[np.bool_]
     environment: Mapping[str, tuple[str, ...]]
-    routes: tuple[FloatArray, ...]
+    task: Mapping[str, FloatArray]
     generators: list[np.random.Generator | None]
     seeded: NDArray[np.bool_]
 
@@ -61,30 +60,22 @@ class EnvState:
         Raises:
             ValueError: naming what differs, and up to three things that only one of the two has.
         """
-        for what, mine in environment.items():
-            theirs = self.environment[what]
-            if theirs != mine:
+        for what in {**environment, **self.environment}:
+            ours, theirs = environment.get(what, ()), self.environment.get(what, ())
+            if theirs != ours:
                 raise ValueError(
-                    f"can't restore: the state is of another environment, the {what} differ: {_only(theirs, mine)} "
-                    f"there, {_only(mine, theirs)} here; make both with the same arguments"
+                    f"can't restore: the state is of another environment, the {what} differ: {_only(theirs, ours)} "
+                    f"there, {_only(ours, theirs)} here; make both with the same arguments"
                 )
 
 
-def signature(fleet: Fleet, task: Task, actuator: Actuator) -> dict[str, tuple[str, ...]]:
+def signature(task: Task, world: World, settings: Settings) -> dict[str, tuple[str, ...]]:
     """What two environments must have in common for one to continue from the other's state, in words."""
-    ids, places = fleet.ids, task.displacement.tolist()
-    leaders = [f"{ids[i]} at {speed} m/s" for i, speed in zip(task.leaders, task.leader_speed, strict=True)]
-    edges = [f"{ids[i]} to {ids[j]} by {d} m" for (i, j), d in zip(task.edges.tolist(), places, strict=True)]
-    return {
-        "tasks": (task.name,),
-        "leaders": tuple(leaders),
-        "task edges": tuple(edges),
-        "actuators": (described(actuator),),
-    }
+    return {**task.signature(world), "actuators": (described(settings.actuator),)}  # type: ignore[arg-type]
 
 
-def _only(one: tuple[str, ...], other: tuple[str, ...]) -> str:
-    """What only `one` has, shortened."""
-    known = set(other)
-    own = [text for text in one if text not in known]
-    return ", ".join(own[:3] + ["..."] * (len(own) > 3)) or ("no others" if one else "none")
+def _only(first: tuple[str, ...], second: tuple[str, ...]) -> str:
+    """The entries that only `first` has, shortened."""
+    known = set(second)
+    own = [text for text in first if text not in known]
+    return ", ".join(own[:3] + ["..."] * (len(own) > 3)) or ("no others" if first else "none")

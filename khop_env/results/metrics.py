@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 import khop_env
-from khop_env.env import Task
 from khop_env.observers import FloatArray, Observers
 from khop_env.physics import Fleet
 from khop_env.results.recording import Recording
@@ -32,21 +31,6 @@ def consensus_error(fleet: Fleet, x: FloatArray) -> FloatArray:
     positions = fleet.positions(x)
     with np.errstate(over="ignore", invalid="ignore"):  # of states that ran away: inf or nan says it
         return np.asarray(np.linalg.norm(positions - positions.mean(axis=-2, keepdims=True), axis=(-2, -1)))
-
-
-def task_error(fleet: Fleet, x: FloatArray, task: Task | None) -> float:
-    """Mean over agents of the root mean square error along their task edges, in m.
-
-    Args:
-        fleet: the agents.
-        x: (n,) their states.
-        task: of an environment; None for agreement, whose error is `consensus_error`.
-    """
-    if task is None:
-        return float(consensus_error(fleet, x))
-    positions, (own, other) = fleet.positions(x), task.edges.T
-    misses = ((positions[other] - positions[own] - task.displacement) ** 2).sum(axis=1)
-    return float(np.mean([np.sqrt(misses[own == i].mean()) for i in np.unique(own)]))
 
 
 def _diverged(x: FloatArray) -> bool:

@@ -80,6 +80,7 @@ class Recording:
         steps: number of steps taken.
         wall_time: seconds spent stepping and sampling; not in compiling.
         error: why the episode ended early, or None. Everything up to then is here.
+        task_error: (T,) the team's mean task error, where an environment's task was played; otherwise None.
     """
 
     design: ObserverDesign
@@ -91,6 +92,7 @@ class Recording:
     steps: int
     wall_time: float
     error: FunnelError | SolveError | None = None
+    task_error: FloatArray | None = None
 
     @property
     def fleet(self) -> Fleet:
@@ -114,6 +116,7 @@ def record(
     dt: float,
     *,
     samples_per_second: float = 100.0,
+    task_error: Callable[[], float] | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Run the simulator from where it stands to `duration`, and keep samples of everything.
@@ -126,6 +129,7 @@ def record(
         dt: step in s.
         samples_per_second: at most this many; fewer where the steps are longer, or the fleet is so large that more
             than `MOST_ROWS` numbers would be kept in an array.
+        task_error: sampled, too, if given: the error of the task that is played.
         progress: told now and then how far it is.
 
     Returns:
@@ -144,7 +148,7 @@ def record(
     width = max(1, design.states.layout.size, design.inputs.layout.size)
     most_samples = max(2, MOST_ROWS // width)
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
-    samples = _Samples(simulator, 1 + math.ceil(steps / stride))
+    samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error)
     error: FunnelError | SolveError | None = None
     with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError does, and a summary says what ran away
         simulator.warm_up()
@@ -174,7 +178,7 @@ def record(
 class _Samples:
     """Arrays for all samples of an episode, filled one by one."""
 
-    def __init__(self, simulator: Simulator, count: int) -> None:
+    def __init__(self, simulator: Simulator, count: int, task_error: Callable[[], float] | None) -> None:
         self._simulator = simulator
         self._sources: dict[str, Callable[[], FloatArray]] = {
             "time": lambda: simulator.t,
@@ -186,6 +190,8 @@ class _Samples:
             "input_estimate": lambda: simulator.input_estimates[0],
             "input_disagreement": lambda: simulator.input_disagreements()[0],
         }
+        if task_error is not None:
+            self._sources["task_error"] = lambda: np.array([task_error()])
         self._arrays = {name: np.empty((count, len(read()))) for name, read in self._sources.items()}
         self._taken = 0
 
@@ -208,4 +214,5 @@ class _Samples:
             steps=steps,
             wall_time=wall_time,
             error=error,
+            task_error=kept["task_error"][:, 0] if "task_error" in kept else None,
         )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import importlib.util
 import itertools
 import subprocess
@@ -14,10 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.env import Task, consensus
-from khop_env.results.metrics import task_error
+from khop_env.env import BatchedEnv
+from khop_env.results.metrics import consensus_error
 from khop_env.results.recording import ObserverRecord, Progress, Recording
 from khop_env.scenarios import Scenario
+from khop_env.tasks import directed
 
 if TYPE_CHECKING:
     from khop_env.env.rendering import Renderer
@@ -54,7 +57,7 @@ def write_video(
     path: str | Path,
     *,
     observer: str | int | None = None,
-    task: Task | None = None,
+    env: BatchedEnv | None = None,
     fps: int = 25,
     speed: float = 1.0,
     progress: Progress | None = None,
@@ -70,7 +73,7 @@ def write_video(
         path: of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
         observer: id or index of the agent whose beliefs are shown; by default the one with most task edges to agents
             that it can't hear.
-        task: of the environment that was run; by default agreement along the scenario's task graph.
+        env: the environment that was played, for its task; by default agreement along the scenario's task graph.
         fps: frames per second, up to 50.
         speed: seconds of the run per second of the film.
         progress: told now and then how far it is.
@@ -90,18 +93,21 @@ def write_video(
     if not (1 <= fps <= 50 and 0.0 < speed < np.inf):
         raise ValueError(f"expected fps from 1 to 50 and a positive, finite speed; got fps={fps!r}, speed={speed!r}")
     shown = None if observer is None else recording.fleet.agent(observer)
-    title = scenario.name if task is None else f"{task.name} on {scenario.name}"
-    edges, leaders = (
-        (consensus(recording.fleet, scenario.task).edges, ()) if task is None else (task.edges, task.leaders)
-    )
     size = SIZES[path.suffix.lower()]
-    renderer = Renderer(recording.design, edges, leaders=leaders, observer=shown, title=title, size=size)
+    if env is None:
+        edges = directed(scenario.task)
+        renderer = Renderer(
+            recording.design, edges, observer=shown, title=scenario.name, error_label="consensus error", size=size
+        )
+    else:
+        title = f"{env.task.name} on {scenario.name}"
+        renderer = Renderer.of(env.task, env.world, observer=shown, title=title, size=size)
     samples = _samples(recording, fps / speed)
-    frames = _frames(renderer, recording, task, samples, progress)
+    frames = _frames(renderer, recording, env, samples, progress)
     try:
         if path.suffix.lower() == ".gif":
             first, middle, last = samples[0], samples[len(samples) // 2], samples[-1]
-            _write_gif(path, frames, fps, np.vstack([*_frames(renderer, recording, task, [first, middle, last])]))
+            _write_gif(path, frames, fps, np.vstack([*_frames(renderer, recording, env, [first, middle, last])]))
         else:
             _write_mp4(path, frames, fps)
     except BaseException:
@@ -123,14 +129,19 @@ def _samples(recording: Recording, per_second: float) -> list[int]:
 def _frames(
     renderer: Renderer,
     recording: Recording,
-    task: Task | None,
+    env: BatchedEnv | None,
     samples: Sequence[int],
     progress: Progress | None = None,
 ) -> Iterator[NDArray[np.uint8]]:
     for number, k in enumerate(samples):
         largest = max(_largest_ratio(kind, k) for kind in (recording.states, recording.inputs))
-        error = task_error(recording.fleet, recording.x[k], task)
-        yield renderer.frame(float(recording.time[k]), recording.x[k], recording.states.estimate[k], largest, error)
+        time, x, errors = float(recording.time[k]), recording.x[k], recording.task_error
+        error = float(consensus_error(recording.fleet, x)) if errors is None else float(errors[k])
+        decorate = None
+        if env is not None:
+            world = dataclasses.replace(env.world, t=recording.time[[k]], x=x[:, None])
+            decorate = functools.partial(env.task.draw, world=world)
+        yield renderer.frame(time, x, recording.states.estimate[k], largest, error, decorate)
         if progress is not None:
             progress((number + 1) / len(samples))
 

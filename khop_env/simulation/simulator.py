@@ -58,7 +58,7 @@ class Simulator:
         disturbance: a `physics.Disturbance`, or None.
         law: feedback law evaluated at every stage (continuous-time closed loop); None to hold the inputs given to
             `step` (sampled control).
-        task: task graph; needed with a law.
+        task: task graph; needed with a law, and by environments.
         observe: what the law sees of agents out of earshot: "estimate", "oracle" or "local".
         observers: how they are stepped; `Proximal(order=2)` by default.
         num_envs: number of environments B.
@@ -94,7 +94,8 @@ class Simulator:
         self.observers: Observers = copy.copy(observers or Proximal())  # its buffers are this simulator's own
         self.observers.prepare(design, num_envs)
         attached = None if disturbance is None else disturbance.attach(self.fleet)
-        views = None if task is None else ViewBuilder(design, task, observe, num_envs)
+        self.task_graph = nx.empty_graph(len(self.fleet)) if task is None else task
+        views = None if law is None else ViewBuilder(design, self.task_graph, observe, num_envs)
         self.plant = FleetPlant(self.fleet, num_envs, attached, law, views)
         self.state = SimulatorState(
             t=np.zeros(num_envs),

@@ -6,9 +6,20 @@ import pickle
 
 import numpy as np
 import pytest
-from playing import CROSS, ENVIRONMENTS, EVERY, MODES, arrays, batched, parallel, play, random_actions, same, state
-
-from khop_env.env import INFO_KEYS
+from playing import (
+    CROSS,
+    ENVIRONMENTS,
+    EVERY,
+    INFO_KEYS,
+    MODES,
+    arrays,
+    batched,
+    parallel,
+    play,
+    random_actions,
+    same,
+    state,
+)
 
 cross = pytest.mark.parametrize(("environment", "name", "observe", "uniform"), CROSS)
 every = pytest.mark.parametrize(("environment", "name"), EVERY)

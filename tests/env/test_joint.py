@@ -5,9 +5,8 @@ import copy
 import gymnasium
 import numpy as np
 import pytest
-from playing import ENVIRONMENTS, EVERY, IDS, built, joint, parallel, same, state
+from playing import ENVIRONMENTS, EVERY, IDS, INFO_KEYS, built, joint, parallel, same, state
 
-from khop_env.env import INFO_KEYS
 from khop_env.registry import make_joint
 
 

@@ -5,12 +5,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from playing import EVERY, built, same
+from playing import EVERY, INFO_KEYS, built, same
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from khop_env import make_sb3_vec, make_vec
-from khop_env.env import INFO_KEYS
 
 COPIES = 2
 

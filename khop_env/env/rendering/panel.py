@@ -27,20 +27,20 @@ _MOST_TYPES = 9
 _STAR = np.array(
     [[r * math.sin(a), r * math.cos(a)] for a, r in zip(np.arange(10) * math.pi / 5, [1, 0.45] * 5, strict=True)]
 )
-_CIRCLE = np.stack([np.cos(np.arange(48) * math.pi / 24), np.sin(np.arange(48) * math.pi / 24)], axis=-1)
+CIRCLE = np.stack([np.cos(np.arange(48) * math.pi / 24), np.sin(np.arange(48) * math.pi / 24)], axis=-1)
 
 
 def draw_agent(
-    canvas: Canvas, look: Look, at: FloatArray, heading: float, radius: float, *, leader: bool, ring: bool
+    canvas: Canvas, look: Look, at: FloatArray, heading: float, radius: float, *, star: bool, ring: bool
 ) -> None:
-    """An agent's marker with a white rim, a star on a leader and a ring around the one whose beliefs are shown."""
+    """An agent's marker with a white rim, a star if it doesn't act, and a ring if its estimates are shown."""
     canvas.marker(1.25 * radius * look.outline, at, heading, "white")
     canvas.marker(radius * look.outline, at, heading, look.color)
-    if leader:
+    if star:
         canvas.marker(0.95 * radius * _STAR, at, 0.0, INK)
         canvas.marker(0.7 * radius * _STAR, at, 0.0, LEADER_COLOR)
     if ring:
-        canvas.marker(2.0 * radius * _CIRCLE, at, 0.0, INK, 0.25 * radius)
+        canvas.marker(2.0 * radius * CIRCLE, at, 0.0, INK, 0.25 * radius)
 
 
 def draw_task_edge(canvas: Canvas, ends: FloatArray, unit: float, thin: float, *, beside: bool = False) -> None:
@@ -58,9 +58,10 @@ class Panel:
         rect: where it is.
         unit: size of a pixel of the usual frame.
         types: text and look of each type of agent.
-        leaders: whether there are any.
+        driven: what agents with a star are called; None if there are none.
         task: whether there are task edges.
         observer: id and look of the agent whose beliefs are shown, if it has any.
+        error_label: what the error beside the gauge is called.
     """
 
     def __init__(
@@ -69,13 +70,14 @@ class Panel:
         unit: float,
         types: Mapping[str, Look],
         *,
-        leaders: bool,
+        driven: str | None,
         task: bool,
         observer: tuple[str, Look] | None,
+        error_label: str = "task error",
     ) -> None:
         self._left, self._top, self._width, _ = rect
-        self._unit = unit
-        self._types, self._leaders, self._task, self._observer = types, leaders, task, observer
+        self._unit, self._error_label = unit, error_label
+        self._types, self._driven, self._task, self._observer = types, driven, task, observer
 
     def draw(self, canvas: Canvas, t: float, normalized: float, task_error: float | None, hidden: int) -> None:
         """Draw it.
@@ -91,7 +93,7 @@ class Panel:
         self._write(canvas, f"t = {t:.2f} s", size=20, advance=38)
         self._draw_gauge(canvas, normalized)
         if task_error is not None:
-            self._write(canvas, f"task error  {task_error:#.3g} m", advance=20)
+            self._write(canvas, f"{self._error_label}  {task_error:#.3g} m", advance=20)
         self._draw_legend(canvas)
         if hidden:
             boxes = "box is" if hidden == 1 else "boxes are"
@@ -132,12 +134,12 @@ class Panel:
             if number == _MOST_TYPES:
                 self._write(canvas, f"and {len(self._types) - number} more types", indent=34)
                 break
-            draw_agent(canvas, look, self._symbol(), 0.0, radius, leader=False, ring=False)
+            draw_agent(canvas, look, self._symbol(), 0.0, radius, star=False, ring=False)
             self._write(canvas, text, indent=34)
         first = next(iter(self._types.values()))
-        if self._leaders:
-            draw_agent(canvas, first, self._symbol(), 0.0, radius, leader=True, ring=False)
-            self._write(canvas, "leader", indent=34)
+        if self._driven is not None:
+            draw_agent(canvas, first, self._symbol(), 0.0, radius, star=True, ring=False)
+            self._write(canvas, self._driven, indent=34)
         dash = np.array([[-12 * unit, 0], [12 * unit, 0]])
         canvas.line(self._symbol() + dash, EDGE_COLOR, 2.0 * unit)
         self._write(canvas, "communication", indent=34)
@@ -151,7 +153,7 @@ class Panel:
         self._line += 12 * unit
         name, own = self._observer
         self._write(canvas, "One agent's beliefs", advance=28)
-        draw_agent(canvas, own, self._symbol(), 0.0, 0.7 * radius, leader=False, ring=True)
+        draw_agent(canvas, own, self._symbol(), 0.0, 0.7 * radius, star=False, ring=True)
         self._write(canvas, name, indent=34)
         ghost, truth = ends = self._symbol() + np.array([[-7 * unit, 0], [9 * unit, 0]])
         canvas.line(ends, first.color, 1.0 * unit)

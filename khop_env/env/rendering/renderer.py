@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from khop_env.env.rendering.camera import Camera, Labels
 from khop_env.env.rendering.canvas import Canvas, Window, load_pygame
-from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
+from khop_env.env.rendering.panel import CIRCLE, Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import (
     EDGE_COLOR,
     PALE,
@@ -29,6 +29,9 @@ from khop_env.env.rendering.scene import (
     undirected,
 )
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
+from khop_env.tasks import MapCanvas, Task, World
+
+Decorate = Callable[[MapCanvas], None]
 
 _MOST_LABELS = 40  # in larger fleets only the agents whose estimates are shown are labelled
 _FADES = 8  # shades of a trail
@@ -44,10 +47,12 @@ class Renderer:
     Args:
         design: the observers, which know the fleet and the communication graph.
         task_edges: (E, 2) directed pairs (i, j): agent i acts on j.
-        leaders: indices of the agents marked as leaders.
+        driven: indices of the agents that don't act, marked with a star.
+        driven_label: what the legend calls them.
         observer: index of the agent whose beliefs are shown; by default the one with most task edges to agents that it
             can't hear.
         title: shown above the picture.
+        error_label: what the error beside the map is called.
         size: width and height in pixels.
 
     Attributes:
@@ -55,7 +60,7 @@ class Renderer:
 
     Raises:
         ModuleNotFoundError: without pygame-ce.
-        ValueError: for an observer or leader that isn't an agent.
+        ValueError: for an observer or a driven agent that isn't an agent.
     """
 
     def __init__(
@@ -63,15 +68,17 @@ class Renderer:
         design: ObserverDesign,
         task_edges: IntArray,
         *,
-        leaders: Sequence[int] = (),
+        driven: Sequence[int] = (),
+        driven_label: str = "driven agent",
         observer: int | None = None,
         title: str = "",
+        error_label: str = "task error",
         size: tuple[int, int] = (900, 720),
     ) -> None:
         load_pygame()
         fleet, agents = design.fleet, len(design.fleet)
         self._fleet, self._title, self._size = fleet, title, size
-        self._leaders = frozenset(fleet.agent(leader) for leader in leaders)
+        self._driven = frozenset(fleet.agent(agent) for agent in driven)
         self.observer = neediest(design, task_edges) if observer is None else fleet.agent(observer)
         self._beliefs = Beliefs(design, self.observer)
         self._edges = undirected(np.array(design.communication.edges, int).reshape(-1, 2))
@@ -94,14 +101,28 @@ class Renderer:
             (size[0] - panel + 20 * self._unit, top, panel - 36 * self._unit, self._map[3]),
             self._unit,
             {f"{kind}  {self._span(kind)}": look for kind, look in self._looks.items()},
-            leaders=bool(self._leaders),
+            driven=driven_label if self._driven else None,
             task=bool(self._tasks),
             observer=(fleet.ids[self.observer], self._look[self.observer]) if self._beliefs.targets else None,
+            error_label=error_label,
         )
         self._canvas: Canvas | None = None
         self._window: Window | None = None
         self._dismissed = False
         self.restart()
+
+    @classmethod
+    def of(cls, task: Task, world: World, **arguments: Any) -> Renderer:
+        """A renderer of a task's fleet: its edges, and the agents that don't act.
+
+        Args:
+            task: bound to the fleet.
+            world: of the task.
+            arguments: others of the renderer.
+        """
+        acting = set(task.acting(world))
+        driven = [i for i in range(len(world.fleet)) if i not in acting]
+        return cls(world.design, task.edges, driven=driven, driven_label=task.driven_label, **arguments)
 
     def restart(self) -> None:
         """Begin a new episode: forget the trails, and where view and labels were."""
@@ -127,7 +148,13 @@ class Renderer:
             trail.popleft()
 
     def frame(
-        self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None = None
+        self,
+        t: float,
+        x: FloatArray,
+        estimates: FloatArray,
+        normalized: float,
+        task_error: float | None = None,
+        decorate: Decorate | None = None,
     ) -> NDArray[np.uint8]:
         """One picture. A time before the last one's begins a new episode.
 
@@ -137,14 +164,21 @@ class Renderer:
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
             task_error: in m, if there is one to show.
+            decorate: draws what a task adds, below the agents.
 
         Returns:
             (H, W, 3) pixels, a fresh array.
         """
-        return self._draw(t, x, estimates, normalized, task_error).array()
+        return self._draw(t, x, estimates, normalized, task_error, decorate).array()
 
     def show(
-        self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None = None
+        self,
+        t: float,
+        x: FloatArray,
+        estimates: FloatArray,
+        normalized: float,
+        task_error: float | None = None,
+        decorate: Decorate | None = None,
     ) -> None:
         """Show the picture that `frame` would return in a window, and wait so that there are at most 25 a second.
 
@@ -156,12 +190,13 @@ class Renderer:
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
             task_error: in m, if there is one to show.
+            decorate: draws what a task adds, below the agents.
         """
         if self._dismissed:
             return
         if self._window is None:
             self._window = Window(self._size, self._title)
-        if self._window.show(self._draw(t, x, estimates, normalized, task_error)):
+        if self._window.show(self._draw(t, x, estimates, normalized, task_error, decorate)):
             self.close()
             self._dismissed = True
 
@@ -180,7 +215,13 @@ class Renderer:
         return names[0] if len(names) == 1 else f"{names[0]}–{names[-1]}"
 
     def _draw(
-        self, t: float, x: FloatArray, estimates: FloatArray, normalized: float, task_error: float | None
+        self,
+        t: float,
+        x: FloatArray,
+        estimates: FloatArray,
+        normalized: float,
+        task_error: float | None,
+        decorate: Decorate | None,
     ) -> Canvas:
         canvas = self._canvas = self._canvas or Canvas(self._size)
         self.remember(t, x)
@@ -188,17 +229,19 @@ class Renderer:
         self._follow(positions, ghosts, t - self._drawn)
         self._drawn = t
         everyone, targets = np.arange(len(positions)), np.array(self._beliefs.targets, int)
-        middles, haunts = self._pixels(positions, everyone), self._pixels(ghosts, targets)
+        middles, ghost_middles = self._pixels(positions, everyone), self._pixels(ghosts, targets)
 
         canvas.clear()
         self._draw_grid(canvas)
         canvas.clip(self._map)
         self._draw_trails(canvas, t)
         hidden = self._draw_boxes(canvas, t, ghosts)
+        if decorate is not None:
+            decorate(_OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
         self._draw_edges(canvas, middles)
         self._draw_agents(canvas, x, middles)
-        self._draw_ghosts(canvas, estimates, middles, haunts)
-        self._draw_labels(canvas, middles, haunts)
+        self._draw_ghosts(canvas, estimates, middles, ghost_middles)
+        self._draw_labels(canvas, middles, ghost_middles)
         canvas.clip(None)
         self._panel.draw(canvas, t, normalized, task_error, hidden)
         canvas.finish()
@@ -222,6 +265,10 @@ class Renderer:
         else:
             pixels = self._camera.pixels(points)
         return np.clip(pixels, -9999.0, 9999.0)  # what is far out of view has to fit into pygame's integers
+
+    def _pixels_in_plane(self, points: FloatArray) -> FloatArray:
+        """(..., 2) pixels of points (..., 2) in m that belong to no agent."""
+        return np.clip(self._camera.pixels(points), -9999.0, 9999.0)
 
     def _draw_grid(self, canvas: Canvas) -> None:
         left, top, width, height = self._map
@@ -282,12 +329,12 @@ class Renderer:
         turned = angles(self._headings, x)
         for agent in np.flatnonzero(np.isfinite(middles).all(axis=1)).tolist():
             at, look = middles[agent], self._look[agent]
-            watching = agent == self.observer and bool(self._beliefs.targets)
-            draw_agent(canvas, look, at, turned[agent], self._radius, leader=agent in self._leaders, ring=watching)
+            observing = agent == self.observer and bool(self._beliefs.targets)
+            draw_agent(canvas, look, at, turned[agent], self._radius, star=agent in self._driven, ring=observing)
 
-    def _draw_ghosts(self, canvas: Canvas, estimates: FloatArray, middles: FloatArray, haunts: FloatArray) -> None:
+    def _draw_ghosts(self, canvas: Canvas, estimates: FloatArray, middles: FloatArray, ghosts: FloatArray) -> None:
         turned = self._beliefs.headings(estimates)
-        for target, at, heading in zip(self._beliefs.targets, haunts, turned, strict=True):
+        for target, at, heading in zip(self._beliefs.targets, ghosts, turned, strict=True):
             if not np.isfinite(at).all():
                 continue
             color = self._look[target].color
@@ -295,20 +342,20 @@ class Renderer:
                 canvas.line(np.array([at, middles[target]]), color, 1.0 * self._unit)
             canvas.marker(1.55 * self._radius * self._look[target].outline, at, heading, color, 1.5 * self._unit)
 
-    def _draw_labels(self, canvas: Canvas, middles: FloatArray, haunts: FloatArray) -> None:
+    def _draw_labels(self, canvas: Canvas, middles: FloatArray, ghosts: FloatArray) -> None:
         """Write short names where they cover no marker, with a line to their own where that isn't near."""
         size = round(12 * self._unit)
         reach = np.full(len(middles), 1.2 * self._radius)
         ghost = 2.0 * self._radius
         reach[[self.observer] * bool(self._beliefs.targets)] = ghost
-        for target, haunt in zip(self._beliefs.targets, haunts, strict=True):
-            if np.hypot(*(haunt - middles[target])) < ghost:
+        for target, at in zip(self._beliefs.targets, ghosts, strict=True):
+            if np.hypot(*(at - middles[target])) < ghost:
                 reach[target] = ghost
         shown = [agent for agent in self._labelled if np.isfinite(middles[agent]).all()]
         extent = np.array([canvas.measure(self._names[agent], size) for agent in shown]).reshape(-1, 2)
         markers = [
             np.hstack([middles - reach[:, None], middles + reach[:, None]]),
-            np.hstack([haunts - ghost, haunts + ghost]),
+            np.hstack([ghosts - ghost, ghosts + ghost]),
         ]
         taken = np.concatenate(markers)
         taken = taken[np.isfinite(taken).all(axis=1)]
@@ -318,3 +365,36 @@ class Renderer:
                 canvas.line(np.array([middle, middles[shown[number]]]), SOFT, 0.75)
             text = self._names[shown[number]]
             canvas.text(text, tuple(middle), size, anchor=(0.5, 0.5), halo=True)
+
+
+class _OnMap:
+    """Drawing in metres, as `tasks.MapCanvas` says.
+
+    Args:
+        canvas: of the frame.
+        pixels: maps points (..., 2) in m to pixels.
+        meters: per pixel.
+        radius: of an agent's marker in pixels.
+    """
+
+    def __init__(
+        self, canvas: Canvas, pixels: Callable[[FloatArray], FloatArray], meters: float, radius: float
+    ) -> None:
+        self._canvas, self._pixels, self._meters, self._radius = canvas, pixels, meters, radius
+
+    def circle(self, center: FloatArray, radius: float, color: str, *, filled: bool = False) -> None:
+        """See `tasks.MapCanvas`."""
+        outline = min(radius / self._meters, 9999.0) * CIRCLE
+        width = 0.0 if filled else 1.5
+        self._canvas.marker(outline, self._pixels(np.asarray(center, float)), 0.0, color, width)
+
+    def line(self, points: FloatArray, color: str, width: float = 2.0) -> None:
+        """See `tasks.MapCanvas`."""
+        self._canvas.line(self._pixels(np.asarray(points, float)), color, width)
+
+    def cross(self, center: FloatArray, color: str) -> None:
+        """See `tasks.MapCanvas`."""
+        middle = self._pixels(np.asarray(center, float))
+        for end in ((1.0, 1.0), (1.0, -1.0)):
+            arm = 0.9 * self._radius * np.array(end)
+            self._canvas.line(np.array([middle - arm, middle + arm]), color, 2.0)

@@ -88,7 +88,7 @@ def undirected(edges: IntArray) -> list[tuple[int, int]]:
 
 def neediest(design: ObserverDesign, task_edges: IntArray) -> int:
     """The agent with most task edges to agents that it can't hear, the first of several."""
-    unheard = [i for i, j in task_edges.tolist() if not design.communication.has_edge(i, j)]
+    unheard = [i for i, j in task_edges.tolist() if (j, i) not in design.links.index]
     return int(np.bincount(unheard, minlength=len(design.fleet)).argmax())
 
 

@@ -5,11 +5,12 @@ import math
 import networkx as nx
 import numpy as np
 import pytest
-from playing import ENVIRONMENTS, EVERY, SCENARIOS, batched, built, parallel, play, random_actions
 
 from khop_env import leader_following_v0
-from khop_env.env import consensus, formation, leader_following
-from khop_env.physics import SingleIntegrator
+from khop_env.observers import Exponential, ObserverDesign
+from khop_env.physics import Fleet, SingleIntegrator
+from khop_env.tasks import Formation, World
+from tests.env.playing import ENVIRONMENTS, EVERY, SCENARIOS, batched, built, parallel, play, random_actions
 
 every = pytest.mark.parametrize(("environment", "name"), EVERY)
 scenarios = pytest.mark.parametrize("name", SCENARIOS)
@@ -85,7 +86,7 @@ def test_success_terminates_when_the_worst_agent_is_near_enough(environment):
 def test_formations_can_be_reached(name):
     """Displacements are differences of points: they cancel both ways and around every cycle of the task graph."""
     built_ = built(name)
-    task = formation(built_.fleet, built_.task)
+    task = batched("formation_v0", name, num_envs=1).task
     wanted = dict(zip(map(tuple, task.edges.tolist()), task.displacement, strict=True))
     assert set(wanted) == {*built_.task.edges, *((j, i) for i, j in built_.task.edges)}
     for (i, j), displacement in wanted.items():
@@ -94,17 +95,18 @@ def test_formations_can_be_reached(name):
     for cycle in nx.cycle_basis(built_.task):
         total = sum(wanted[i, j] for i, j in zip(cycle, cycle[1:] + cycle[:1], strict=True))
         np.testing.assert_allclose(total, 0.0, atol=1e-12)
-    assert task.leaders == ()
 
 
 @pytest.mark.parametrize("agents", [5, 12, 13, 30])
 def test_default_neighbours_are_the_spacing_apart(agents):
     """On a ring up to 12 agents, and in a square grid of more; nobody stands on another's place."""
-    from khop_env.registry import scenario
-
-    fleet = scenario("random_geometric", agents=agents).fleet
+    fleet = Fleet((SingleIntegrator(),) * agents)
     everybody = nx.complete_graph(agents)
-    task = formation(fleet, everybody, spacing=0.8)
+    bound = Exponential(10.0, 1.0, 1.0)
+    design = ObserverDesign(fleet, nx.path_graph(agents), 2, bound, bound)
+    none = np.zeros((fleet.n, 1))
+    task = Formation(spacing=0.8)
+    task.bind(World(design, everybody, 1, 0.05, 100.0, np.zeros(1), none, none))
     distance = np.linalg.norm(task.displacement, axis=1).reshape(agents, agents - 1)
     np.testing.assert_allclose(distance.min(axis=1), 0.8)
     assert distance.max() <= 0.8 * max(math.sqrt(2.0 * agents) + 1.0, 1.0 / math.sin(math.pi / agents))
@@ -133,8 +135,8 @@ def test_points_and_spacing_are_the_users_to_choose():
             r"points must be finite, of shape \(agents, position axes\) = \(8, 2\).*\(8, 3\)",
         ),
         ({"points": np.full((8, 2), np.nan)}, "points must be finite"),
-        ({"spacing": 0.0}, "spacing must be positive and finite; got 0.0"),
-        ({"spacing": math.inf}, "spacing must be positive and finite; got inf"),
+        ({"spacing": 0.0}, "spacing must be a positive, finite number; got 0.0"),
+        ({"spacing": math.inf}, "spacing must be a positive, finite number; got inf"),
     ],
 )
 def test_formations_that_are_none_are_refused(arguments, message):
@@ -144,7 +146,7 @@ def test_formations_that_are_none_are_refused(arguments, message):
 
 @scenarios
 def test_consensus_is_to_meet_along_the_task_graph(name):
-    task = consensus(built(name).fleet, built(name).task)
+    task = batched("consensus_v0", name, num_envs=1).task
     assert not task.displacement.any()
     assert len(task.edges) == 2 * built(name).task.number_of_edges()
 
@@ -155,13 +157,13 @@ def test_consensus_is_to_meet_along_the_task_graph(name):
 @scenarios
 def test_every_scenario_has_leaders_that_their_followers_cannot_hear(name):
     """At least two leaders; each follower has one, 2 to k hops away, with a task edge and a place around it."""
-    task, built_ = leader_following(built(name).fleet, built(name).communication, built(name).k), built(name)
-    assert len(task.leaders) >= 2
+    task, built_ = batched("leader_following_v0", name, num_envs=1).task, built(name)
+    assert len(task.leader_indices) >= 2
     hops = dict(nx.all_pairs_shortest_path_length(built_.communication))
-    followers = [i for i in range(len(built_.fleet)) if i not in task.leaders]
+    followers = [i for i in range(len(built_.fleet)) if i not in task.leader_indices]
     assert task.edges[:, 0].tolist() == followers
     for i, j in task.edges.tolist():
-        assert j in task.leaders
+        assert j in task.leader_indices
         assert 2 <= hops[i][j] <= built_.k
     np.testing.assert_allclose(np.linalg.norm(task.displacement, axis=1), 1.0)
     assert len({(j, *d) for (_, j), d in zip(task.edges.tolist(), task.displacement.tolist(), strict=True)}) == len(
@@ -172,8 +174,8 @@ def test_every_scenario_has_leaders_that_their_followers_cannot_hear(name):
 def test_the_convoy_s_leaders():
     """The three quick ones, at half their limit."""
     env = parallel("leader_following_v0", "convoy")
-    assert env.batched.task.leaders == (0, 3, 6)
-    assert env.batched.task.leader_speed == (3.0,) * 3
+    assert env.batched.task.leader_indices == (0, 3, 6)
+    assert env.batched.task.speeds == (3.0,) * 3
     assert env.possible_agents == ["drifter_1", "drifter_2", "drifter_4", "drifter_5", "drifter_7"]
 
 
@@ -182,7 +184,7 @@ def test_leaders_take_no_part_but_are_in_the_state(name):
     """No agent, no reward, no action; state() holds them, and other agents' task graphs don't matter."""
     env = parallel("leader_following_v0", name)
     env.reset(seed=0)
-    fleet, leaders = env.batched.fleet, env.batched.task.leaders
+    fleet, leaders = env.batched.fleet, env.batched.task.leader_indices
     ids = [fleet.ids[i] for i in leaders]
     returned = play(env, 1)[0]
     assert set(env.possible_agents) == set(fleet.ids) - set(ids)
@@ -209,7 +211,7 @@ def test_leaders_move_smoothly_at_the_speed_asked_for_and_stay_near():
     speed, step = 0.8, 0.02
     env = quick_leaders(speed)
     env.reset(seed=0)
-    index = env.fleet.position_index[list(env.task.leaders)]
+    index = env.fleet.position_index[list(env.task.leader_indices)]
     actions = np.zeros((20, len(env.agents), 2))
     track = [env.simulator.x[:, index]]
     for _ in range(1000):
@@ -231,7 +233,7 @@ def test_leaders_stay_near_in_spite_of_drift_and_disturbance():
     """The convoy's unstable drift doesn't carry them away within an episode, and inputs stay in their limits."""
     env = batched("leader_following_v0", "convoy", num_envs=10, max_cycles=400)
     env.reset(seed=0)
-    index = env.fleet.position_index[list(env.task.leaders)]
+    index = env.fleet.position_index[list(env.task.leader_indices)]
     start = env.simulator.x[:, index].copy()
     for _ in range(400):
         env.step(np.zeros((10, len(env.agents), 2)))
@@ -251,7 +253,7 @@ def test_leaders_stay_near_in_spite_of_drift_and_disturbance():
         ({"follow": {"drifter_0": "drifter_3"}}, "follow: 'drifter_0' isn't a follower"),
         ({"follow": {"drifter_1": "drifter_2"}}, "follow: 'drifter_2' isn't a leader"),
         ({"follow": {"drifter_1": "drifter_6"}}, "'drifter_1' knows nothing of 'drifter_6', which is more than k hops"),
-        ({"leader_speed": 0.0}, "leader_speed must be positive and finite; got 0.0"),
+        ({"leader_speed": 0.0}, "leader_speed must be a positive, finite number; got 0.0"),
         ({"spacing": -1.0}, "spacing must be finite and not negative; got -1.0"),
     ],
 )
@@ -265,10 +267,10 @@ def test_leaders_and_followers_are_the_users_to_choose():
     env = parallel(
         "leader_following_v0", "convoy", leaders=["drifter_3"], follow={"drifter_2": "drifter_3"}, spacing=0.0
     )
-    assert env.batched.task.leaders == (3,)
+    assert env.batched.task.leader_indices == (3,)
     assert not env.batched.task.displacement.any()
     assert set(env.batched.task.edges[:, 1].tolist()) == {3}
     one = parallel("leader_following_v0", "convoy", leaders=("drifter_0", "drifter_6"), leader_speed=1.5)
-    assert one.batched.task.leaders == (0, 6)
-    assert one.batched.task.leader_speed == (1.5, 1.5)
-    assert len(parallel("leader_following_v0", "convoy", leaders=4).batched.task.leaders) == 4
+    assert one.batched.task.leader_indices == (0, 6)
+    assert one.batched.task.speeds == (1.5, 1.5)
+    assert len(parallel("leader_following_v0", "convoy", leaders=4).batched.task.leader_indices) == 4

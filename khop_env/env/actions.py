@@ -1,0 +1,121 @@
+"""From actions to commanded inputs: which entry of a flat action is which agent's input, checks and clipping."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from khop_env.compiled import compiled
+from khop_env.observers import FloatArray, IntArray
+from khop_env.physics import Fleet
+
+
+class ActionReader:
+    """Reads the actions of all acting agents, side by side.
+
+    Args:
+        fleet: all agents.
+        members: indices of those that act.
+        uniform: whether all have as many entries, padded.
+        num_envs: number of environments B.
+
+    Attributes:
+        offset: (N + 1,) where each agent's entries begin in the flat action.
+
+    Raises:
+        ValueError: for an acting agent whose inputs have no limit.
+    """
+
+    def __init__(self, fleet: Fleet, members: Sequence[int], uniform: bool, num_envs: int) -> None:
+        self._agents, self._num_envs, self._uniform = [fleet.ids[i] for i in members], num_envs, uniform
+        models = [fleet.models[i] for i in members]
+        unlimited = [
+            name for name, model in zip(self._agents, models, strict=True) if not np.isfinite(model.input_limit).all()
+        ]
+        if unlimited:
+            raise ValueError(
+                f"actions are fractions of the input limits, and {', '.join(unlimited[:4])} has none: give its model "
+                "an input_limit"
+            )
+        sizes = np.array([model.m for model in models])
+        self.offset: IntArray = np.concatenate([[0], np.cumsum(np.full(len(sizes), sizes.max()) if uniform else sizes)])
+        parts = [(number, c) for number, size in enumerate(sizes) for c in range(size)]
+        first = fleet.input_offset[list(members)]
+        self._owner = np.array([number for number, _ in parts], np.int64)
+        self._entry = np.array([self.offset[number] + c for number, c in parts], np.int64)
+        self._column = np.array([first[number] + c for number, c in parts], np.int64)
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Shapes that actions may have, the usual one first."""
+        width = int(self.offset[-1])
+        flat: list[tuple[int, ...]] = [(self._num_envs, width)]
+        return [(self._num_envs, len(self._agents), width // len(self._agents)), *flat] if self._uniform else flat
+
+    def read(self, actions: ArrayLike, command: FloatArray) -> IntArray:
+        """Write actions into `command` (m, B) as fractions of the limits, clipped to [-1, 1].
+
+        Args:
+            actions: (B, N, m) or (B, A).
+            command: overwritten, where an acting agent has an input; or left alone if this raises.
+
+        Returns:
+            (B, N) how many entries of each agent's action were clipped.
+
+        Raises:
+            ValueError: for actions of a wrong shape or not finite.
+        """
+        array = np.asarray(actions)
+        if array.shape not in self.shapes or array.dtype.kind not in "fiu":
+            raise ValueError(
+                f"actions must be numbers of shape {self.shapes[0]}; got {array.dtype} of shape {array.shape}"
+            )
+        flat = np.ascontiguousarray(array.reshape(self._num_envs, -1), np.float64)
+        clipped = np.zeros((self._num_envs, len(self._agents)), np.int64)
+        bad = read_actions(flat, self._entry, self._column, self._owner, command, clipped)
+        if bad >= 0:
+            env, number = divmod(bad, len(self._entry))
+            owner = self._owner[number]
+            where = f" in copy {env}" if self._num_envs > 1 else ""
+            raise ValueError(
+                f"the action of {self._agents[owner]!r}{where} isn't finite: entry "
+                f"{self._entry[number] - self.offset[owner]} is {flat[env, self._entry[number]]}"
+            )
+        return clipped
+
+
+@compiled
+def read_actions(
+    actions: FloatArray, entry: IntArray, column: IntArray, owner: IntArray, command: FloatArray, clipped: IntArray
+) -> int:
+    """Clip actions to [-1, 1] and write them into `command` (m, B); count what was clipped.
+
+    Args:
+        actions: (B, A) all agents' actions of each environment, side by side.
+        entry: (C,) which entry of an environment's actions is read.
+        column: (C,) the input it becomes.
+        owner: (C,) number of the agent whose it is.
+        command: (m, B) overwritten at `column`.
+        clipped: (B, N) added to.
+
+    Returns:
+        -1, or where the first action is that isn't finite: environment * C + place in `entry`. Nothing is written then.
+    """
+    for env in range(actions.shape[0]):
+        for q in range(entry.size):
+            value = actions[env, entry[q]]
+            if not np.isfinite(value):
+                return env * entry.size + q
+    for env in range(actions.shape[0]):
+        for q in range(entry.size):
+            value = actions[env, entry[q]]
+            if value > 1.0:
+                value = 1.0
+                clipped[env, owner[q]] += 1
+            elif value < -1.0:
+                value = -1.0
+                clipped[env, owner[q]] += 1
+            command[column[q], env] = value
+    return -1

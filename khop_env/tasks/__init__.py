@@ -1,0 +1,21 @@
+"""Tasks: one file each, on any scenario. `Task` is what a task of your own derives from."""
+
+from khop_env.tasks.base import Column, MapCanvas, Outcome, Task, World, directed
+from khop_env.tasks.consensus import Consensus
+from khop_env.tasks.edges import EdgeArguments, EdgeTask
+from khop_env.tasks.formation import Formation
+from khop_env.tasks.leader_following import LeaderFollowing
+
+__all__ = [
+    "Column",
+    "Consensus",
+    "EdgeArguments",
+    "EdgeTask",
+    "Formation",
+    "LeaderFollowing",
+    "MapCanvas",
+    "Outcome",
+    "Task",
+    "World",
+    "directed",
+]

@@ -1,0 +1,240 @@
+"""Base class of tasks: who acts, what is good, when it is over, and what an observation shows beside states.
+
+A task is one file. It is bound to a fleet once, and then asked at every control period; an environment
+(`khop_env.env`) does the rest: observations, actions, seeds, rendering, saving and restoring.
+"""
+
+from __future__ import annotations
+
+import abc
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.observers import FloatArray, IntArray, ObserverDesign
+from khop_env.physics import Fleet
+
+Signature = dict[str, tuple[str, ...]]
+"""Properties in words, by a plural noun: what two environments must have in common to exchange states."""
+
+
+@dataclass(eq=False)
+class World:
+    """The true state of B environments, as tasks see it: arrays with the batch as their last axis.
+
+    Attributes:
+        design: the observers, which know the fleet and the communication graph.
+        graph: the scenario's task graph on the agents' indices.
+        num_envs: number of environments B.
+        control_period: time between actions in s.
+        limit: bound on positions and other states in observations, in their own units.
+        t: (B,) time since reset in s.
+        x: (n, B) states.
+        inputs: (m, B) inputs in force, as fractions of their limits.
+    """
+
+    design: ObserverDesign
+    graph: nx.Graph
+    num_envs: int
+    control_period: float
+    limit: float
+    t: FloatArray
+    x: FloatArray
+    inputs: FloatArray
+
+    @property
+    def fleet(self) -> Fleet:
+        """All agents."""
+        return self.design.fleet
+
+    def positions(self) -> FloatArray:
+        """(N, d, B) positions in m, in new memory."""
+        return self.x[self.fleet.position_index]
+
+
+class Outcome(NamedTuple):
+    """The result of one control period.
+
+    Attributes:
+        reward: (B, N) of each acting agent.
+        terminated: (B,) whether the episode has ended, for the whole team.
+        infos: (B, N) each, by name; "task_error" has to be among them: how far an agent is from what it should reach.
+    """
+
+    reward: FloatArray
+    terminated: NDArray[np.bool_]
+    infos: dict[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column that a task adds to an observation: a constant, or live.
+
+    Attributes:
+        name: of the field, e.g. "goal.x".
+        unit: e.g. "m"; "" where it has none.
+        low: smallest value; smaller ones are clipped, and counted in the infos.
+        high: largest value.
+        value: of a constant.
+        row: of a live column, the row that `Task.observe` writes.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    value: float = 0.0
+    row: int | None = None
+
+
+class MapCanvas(Protocol):
+    """Draws on the map of a frame, in metres; colours are "#RRGGBB"."""
+
+    def circle(self, center: FloatArray, radius: float, color: str, *, filled: bool = False) -> None:
+        """A circle about `center` (2,)."""
+        ...
+
+    def line(self, points: FloatArray, color: str, width: float = 2.0) -> None:
+        """A line through `points` (K, 2), `width` pixels wide."""
+        ...
+
+    def cross(self, center: FloatArray, color: str) -> None:
+        """A cross at `center` (2,), of the size of an agent's marker."""
+        ...
+
+
+class Task(abc.ABC):
+    """What a team is to do. A subclass implements `evaluate`; everything else has a default.
+
+    Attributes:
+        name: of the environment without its version; by default the class's name in snake case.
+        version: of the environment.
+        default_scenario: name of the scenario that it is played on unless another one is asked for.
+        driven_label: what an agent that doesn't act is called.
+        edges: (E, 2) directed pairs (i, j), sorted: agent j matters to agent i's task. Set by `bind`. Slots of
+            observations begin with these agents, laws act along these edges, and frames show them.
+        memory: arrays that the next steps depend on, e.g. what `reset` has drawn; saved and restored with the state.
+    """
+
+    name: ClassVar[str] = ""
+    version: ClassVar[int] = 0
+    default_scenario: ClassVar[str] = "paper"
+    driven_label: ClassVar[str] = "driven agent"
+    edges: IntArray = np.zeros((0, 2), np.int64)
+    memory: dict[str, FloatArray]
+
+    def __init_subclass__(cls, **arguments: object) -> None:
+        super().__init_subclass__(**arguments)
+        if "name" not in vars(cls):
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", cls.__name__).lower()
+
+    @property
+    def environment(self) -> str:
+        """Name of the environment, e.g. "consensus_v0"."""
+        return f"{self.name}_v{self.version}"
+
+    def bind(self, world: World) -> None:
+        """Get ready for a fleet: index arrays, `edges`, zeroed `memory`. Called once, before everything else.
+
+        Args:
+            world: whose arrays aren't meaningful yet.
+
+        Raises:
+            ValueError: if the task can't be done by this fleet.
+        """
+        self.memory = {}
+
+    def acting(self, world: World) -> Sequence[int]:
+        """Indices of the agents that act, ascending; all by default. `drive` moves the others."""
+        return range(len(world.fleet))
+
+    def columns(self, world: World, agent: int) -> Sequence[Column]:
+        """Columns of an agent's observation beside its own state and slots; none by default.
+
+        Args:
+            world: for names, models and limits.
+            agent: index of the observing agent; with uniform observations all agents need as many columns.
+        """
+        return ()
+
+    def slot_columns(self, world: World, agent: int, other: int) -> Sequence[Column]:
+        """Columns of a slot beside the other agent's state; none by default.
+
+        Args:
+            world: for names, models and limits.
+            agent: index of the observing agent.
+            other: index of the agent that the slot is about; all slots need as many columns.
+        """
+        return ()
+
+    def observe(self, world: World, out: FloatArray) -> None:  # noqa: B027
+        """Write the values of live columns.
+
+        Args:
+            world: now.
+            out: (rows, B) to be overwritten.
+        """
+
+    def reset(self, world: World, env_ids: IntArray, rngs: Sequence[np.random.Generator]) -> None:  # noqa: B027
+        """Draw what an episode needs; does nothing by default.
+
+        Args:
+            world: at the beginning of the new episodes; initial states are drawn before, from the same generators.
+            env_ids: (R,) indices of the environments that are reset.
+            rngs: (R,) their generators.
+        """
+
+    def drive(self, world: World, u: FloatArray) -> None:  # noqa: B027
+        """Write the inputs of agents that don't act; called before every step of the simulator.
+
+        Args:
+            world: now.
+            u: (m, B) physical inputs, to be overwritten in the rows of these agents.
+        """
+
+    @abc.abstractmethod
+    def evaluate(self, world: World) -> Outcome:
+        """Rewards, whether it is over, and infos.
+
+        It is called after resets, too, of some environments or all, and whenever the task error is asked for: a second
+        call at the same instant has to give the same and to change nothing.
+
+        Args:
+            world: at the end of a control period.
+        """
+
+    def robust_reward(self, reward: FloatArray, infos: Mapping[str, FloatArray], limit: float) -> FloatArray:
+        """Rewards for training, in which rare large errors don't dominate; by default the rewards as they are.
+
+        Args:
+            reward: (B, N) of `evaluate`.
+            infos: (B, N) each, of `evaluate`.
+            limit: error from which the reward should grow linearly only, in the unit of "task_error".
+        """
+        return reward
+
+    def signature(self, world: World) -> Signature:
+        """What two tasks must have in common for one to continue from the other's state, in words."""
+        ids = world.fleet.ids
+        return {
+            "tasks": (self.name,),
+            "task edges": tuple(f"{ids[i]} to {ids[j]}" for i, j in self.edges.tolist()),
+        }
+
+    def draw(self, canvas: MapCanvas, world: World) -> None:  # noqa: B027
+        """Draw on a frame, below the agents; nothing by default.
+
+        Args:
+            canvas: in metres.
+            world: of one environment.
+        """
+
+
+def directed(graph: nx.Graph) -> IntArray:
+    """(E, 2) both directions of each edge of an undirected graph, sorted."""
+    return np.array(sorted([*graph.edges, *((j, i) for i, j in graph.edges)]), np.int64).reshape(-1, 2)

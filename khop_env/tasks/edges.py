@@ -1,0 +1,209 @@
+"""Tasks along edges: agent i wants p_j - p_i = d_ij for each of its edges (i, j)."""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, TypedDict
+
+import numpy as np
+
+from khop_env.compiled import compiled
+from khop_env.observers import FloatArray, IntArray
+from khop_env.tasks.base import Column, Outcome, Signature, Task, World
+
+Reward = Literal["agent", "team"]
+NUMBER = (int, float, np.integer, np.floating)
+
+
+class EdgeArguments(TypedDict, total=False):
+    """Keyword arguments of every `EdgeTask`, for type checkers."""
+
+    reward: Reward
+    effort: float
+    success_radius: float | None
+
+
+class EdgeArrays(NamedTuple):
+    """The edges of acting agents, and whose input is whose, as the compiled loop takes them.
+
+    Attributes:
+        agent: (E,) number of the acting agent that an edge belongs to.
+        own: (E, d) its position in the states.
+        other: (E, d) the other's.
+        displacement: (E, d) what p_other - p_own should be, in m.
+        weight: (E,) one over the number of the agent's edges.
+        input_owner: (m,) number of the acting agent whose input it is; -1 for agents that don't act.
+    """
+
+    agent: IntArray
+    own: IntArray
+    other: IntArray
+    displacement: FloatArray
+    weight: FloatArray
+    input_owner: IntArray
+
+
+@dataclass(eq=False, kw_only=True)
+class EdgeTask(Task):
+    """Agents keep displacements along directed task edges; a subclass says which, in `relations`.
+
+    Every control period agent i gets -control_period (mean over its edges of |p_j - p_i - d_ij|^2 + effort |u_i|^2),
+    with true positions at the end of the period and inputs u_i as fractions of their limits.
+
+    Attributes:
+        reward: "agent" for each agent's own, "team" for the mean of all.
+        effort: weight of the squared input, in m^2.
+        success_radius: terminate when no agent's task error exceeds it, in m; None to go on to the horizon.
+        displacement: (E, d) d_ij of `edges` in m. Set by `bind`.
+
+    Raises:
+        ValueError: naming the argument, the value, and what is expected.
+    """
+
+    reward: Reward = "agent"
+    effort: float = 0.1
+    success_radius: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.reward not in ("agent", "team"):
+            raise ValueError(f"reward must be 'agent' or 'team'; got {self.reward!r}")
+        if not isinstance(self.effort, NUMBER) or not 0.0 <= self.effort < math.inf:
+            raise ValueError(f"effort must be finite and not negative; got {self.effort!r}")
+        if self.success_radius is not None:
+            require_positive("success_radius", self.success_radius)
+
+    @abc.abstractmethod
+    def relations(self, world: World) -> tuple[IntArray, FloatArray]:
+        """The directed task edges (E, 2), sorted, and the displacement (E, d) to keep along each, in m."""
+
+    def bind(self, world: World) -> None:
+        """Find the edges, and where the compiled loop reads."""
+        super().bind(world)
+        self.edges, self.displacement = self.relations(world)
+        fleet, members = world.fleet, list(self.acting(world))
+        number = {agent: place for place, agent in enumerate(members)}
+        counted = np.array([i in number for i in self.edges[:, 0].tolist()], bool)
+        edges, position = self.edges[counted], fleet.position_index
+        agent = np.array([number[i] for i in edges[:, 0].tolist()], np.int64)
+        input_owner = np.full(fleet.m, -1, np.int64)
+        for place, i in enumerate(members):
+            input_owner[fleet.input_slice(i)] = place
+        self._arrays = EdgeArrays(
+            agent,
+            np.ascontiguousarray(position[edges[:, 0]]),
+            np.ascontiguousarray(position[edges[:, 1]]),
+            np.ascontiguousarray(self.displacement[counted]),
+            1.0 / np.bincount(agent, minlength=len(members))[agent],
+            input_owner,
+        )
+        self._period = world.control_period
+        self._squares = np.zeros((len(members), world.num_envs))
+        self._efforts = np.zeros((len(members), world.num_envs))
+
+    def slot_columns(self, world: World, agent: int, other: int) -> Sequence[Column]:
+        """The displacement wanted along the edge; zeros without one."""
+        reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
+        wanted = self._wanted(agent, other)
+        names = axis_names(world.fleet.position_dim)
+        return [Column(f"displacement.{axis}", "m", -reach, reach, d) for axis, d in zip(names, wanted, strict=True)]
+
+    def evaluate(self, world: World) -> Outcome:
+        """See the class; "task_error" is the root mean square error along the agent's own edges in m."""
+        shape = world.num_envs, len(self._squares)
+        reward, error = np.empty(shape), np.empty(shape)
+        period, effort = world.control_period, float(self.effort)
+        evaluate_edges(self._arrays, world.x, world.inputs, period, effort, self._squares, self._efforts, reward, error)
+        if self.reward == "team":
+            reward[...] = reward.mean(axis=1, keepdims=True)
+        terminated = np.zeros(world.num_envs, bool)
+        if self.success_radius is not None:
+            terminated = error.max(axis=1) <= self.success_radius
+        return Outcome(reward, terminated, {"task_error": error})
+
+    def robust_reward(self, reward: FloatArray, infos: Mapping[str, FloatArray], limit: float) -> FloatArray:
+        """Huber's form of the squared task error: quadratic up to `limit`, linear beyond."""
+        excess = np.maximum(infos["task_error"] - limit, 0.0)  # error^2 - huber(error) = excess^2
+        return reward + (self._period * excess * excess).astype(reward.dtype)
+
+    def signature(self, world: World) -> Signature:
+        """Name, edges and displacements."""
+        ids, places = world.fleet.ids, self.displacement.tolist()
+        edges = [f"{ids[i]} to {ids[j]} by {d} m" for (i, j), d in zip(self.edges.tolist(), places, strict=True)]
+        return {**super().signature(world), "task edges": tuple(edges)}
+
+    def _wanted(self, agent: int, other: int) -> list[float]:
+        found = np.flatnonzero((self.edges[:, 0] == agent) & (self.edges[:, 1] == other))
+        return self.displacement[found[0]].tolist() if found.size else [0.0] * self.displacement.shape[1]
+
+
+def require_positive(name: str, value: object) -> None:
+    """Refuse an argument that isn't a positive, finite number.
+
+    Raises:
+        ValueError: naming the argument and the value.
+    """
+    if not isinstance(value, NUMBER) or not 0.0 < value < math.inf:
+        raise ValueError(f"{name} must be a positive, finite number; got {value!r}")
+
+
+def axis_names(dim: int) -> list[str]:
+    """Names of the position's axes, common to all models."""
+    return list("xyz"[:dim]) if dim <= 3 else [f"axis{q}" for q in range(dim)]
+
+
+def ring(count: int, dim: int) -> FloatArray:
+    """`count` points on a circle of radius 1 in the first two axes; on a line alternately left and right."""
+    points = np.zeros((count, dim))
+    if dim == 1:
+        points[:, 0] = [(1 + q // 2) * (-1) ** q for q in range(count)]
+    else:
+        angle = 2.0 * math.pi * np.arange(count) / max(count, 1)
+        points[:, 0], points[:, 1] = np.cos(angle), np.sin(angle)
+    return points
+
+
+@compiled
+def evaluate_edges(
+    edges: EdgeArrays,
+    x: FloatArray,
+    inputs: FloatArray,
+    period: float,
+    effort: float,
+    squares: FloatArray,
+    efforts: FloatArray,
+    reward: FloatArray,
+    error: FloatArray,
+) -> None:
+    """Write every agent's reward, and its root mean square error along its task edges.
+
+    Args:
+        edges: of the acting agents.
+        x: (n, B) states.
+        inputs: (m, B) inputs as fractions of their limits.
+        period: control period in s.
+        effort: weight of the squared inputs in m^2.
+        squares: (N, B) scratch.
+        efforts: (N, B) scratch.
+        reward: (B, N) overwritten with -period * (mean square error + effort * |u|^2).
+        error: (B, N) overwritten with the root mean square error in m.
+    """
+    squares[:] = 0.0
+    efforts[:] = 0.0
+    for edge in range(edges.agent.size):
+        agent, weight = edges.agent[edge], edges.weight[edge]
+        for c in range(edges.own.shape[1]):
+            for env in range(x.shape[1]):
+                miss = x[edges.other[edge, c], env] - x[edges.own[edge, c], env] - edges.displacement[edge, c]
+                squares[agent, env] += weight * miss * miss
+    for column in range(edges.input_owner.size):
+        owner = edges.input_owner[column]
+        if owner >= 0:
+            for env in range(inputs.shape[1]):
+                efforts[owner, env] += inputs[column, env] * inputs[column, env]
+    for env in range(reward.shape[0]):
+        for i in range(reward.shape[1]):
+            reward[env, i] = -period * (squares[i, env] + effort * efforts[i, env])
+            error[env, i] = np.sqrt(squares[i, env])

@@ -1,0 +1,177 @@
+"""Follow leaders that are out of range: they move along smooth random routes, which no other agent knows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from khop_env.observers import FloatArray, IntArray
+from khop_env.physics import AgentModel, Fleet, did_you_mean, hop_distances, velocity_to_input
+from khop_env.tasks.base import Signature, World
+from khop_env.tasks.edges import EdgeTask, require_positive, ring
+
+SINES = 3  # per axis
+BAND = (1.5, 2.5)  # rad/s: where the routes' frequencies are drawn from
+POSITION_GAIN = 1.0  # 1/s: pulls a leader back to its route, so that drift and disturbance don't carry it away
+
+
+@dataclass(eq=False, kw_only=True)
+class LeaderFollowing(EdgeTask):
+    """Each follower keeps its place around a leader that it can't hear, if there is one within k hops.
+
+    Leaders take no part in the environment. Along each axis a leader's route has a velocity that is a sum of `SINES`
+    sines with frequencies drawn from `BAND` and random phases; the leader is commanded that velocity plus
+    `POSITION_GAIN` times its distance to the route.
+
+    Attributes:
+        leaders: their ids, or how many; by default as many of the fastest as it takes for every follower to have one
+            at 2 hops or more, and at least two.
+        follow: the leader of each follower by id; by default the nearest at 2 hops or more.
+        leader_speed: root mean square speed in m/s; by default half of a leader's limit where its input is a velocity
+            in m/s, and 0.5 m/s otherwise.
+        spacing: radius of the ring around a leader on which its followers have their places, in m; 0 to meet it.
+
+    Raises:
+        ValueError: for unknown agents, no follower, or a leader that its follower neither hears nor estimates.
+    """
+
+    default_scenario: ClassVar[str] = "convoy"
+    driven_label: ClassVar[str] = "leader"
+    leaders: int | Sequence[str | int] | None = None
+    follow: Mapping[str, str] | None = None
+    leader_speed: float | None = None
+    spacing: float = 1.0
+
+    def bind(self, world: World) -> None:
+        """Choose leaders, assign followers, and make room for the routes."""
+        hops = hop_distances(world.design.communication, world.design.k)
+        fleet = world.fleet
+        chosen = _choose_leaders(fleet, hops, self.leaders)
+        if not chosen or len(chosen) == len(fleet):
+            raise ValueError(
+                f"leader following needs at least one leader and one follower; got {len(chosen)} leaders of "
+                f"{len(fleet)} agents"
+            )
+        if self.leader_speed is not None:
+            require_positive("leader_speed", self.leader_speed)
+        if not 0.0 <= self.spacing < math.inf:
+            raise ValueError(f"spacing must be finite and not negative; got {self.spacing!r}")
+        self.leader_indices = tuple(chosen)
+        self.speeds = tuple(
+            float(_speed(fleet.models[i])) if self.leader_speed is None else float(self.leader_speed) for i in chosen
+        )
+        self._pairs = _assign_followers(fleet, hops, chosen, dict(self.follow or {}))
+        super().bind(world)
+        shape = len(chosen), fleet.position_dim
+        self.memory = {
+            "frequency": np.ones((world.num_envs, *shape, SINES)),  # rad/s
+            "phase": np.ones((world.num_envs, *shape, SINES)),
+            "start": np.zeros((world.num_envs, *shape)),  # m, where the routes begin
+        }
+        self._amplitude = np.array(self.speeds).reshape(-1, 1, 1) * math.sqrt(2.0 / (SINES * shape[1]))
+        self._positions = fleet.position_index[list(chosen)]
+
+    def relations(self, world: World) -> tuple[IntArray, FloatArray]:
+        """An edge from each follower to its leader, with its place on the ring around it."""
+        displacement = np.zeros((len(self._pairs), world.fleet.position_dim))
+        for leader in self.leader_indices:
+            followers = [number for number, (_, other) in enumerate(self._pairs) if other == leader]
+            displacement[followers] = -self.spacing * ring(len(followers), world.fleet.position_dim)
+        return np.array(self._pairs, np.int64), displacement
+
+    def acting(self, world: World) -> Sequence[int]:
+        """The followers."""
+        return [i for i in range(len(world.fleet)) if i not in self.leader_indices]
+
+    def reset(self, world: World, env_ids: IntArray, rngs: Sequence[np.random.Generator]) -> None:
+        """Draw the routes, which begin where the leaders are."""
+        frequency, phase = self.memory["frequency"], self.memory["phase"]
+        for env, rng in zip(env_ids.tolist(), rngs, strict=True):
+            frequency[env] = rng.uniform(*BAND, frequency.shape[1:])
+            phase[env] = rng.uniform(0.0, 2.0 * math.pi, phase.shape[1:])
+            self.memory["start"][env] = world.x[self._positions, env]
+
+    def drive(self, world: World, u: FloatArray) -> None:
+        """The leaders' inputs along their routes."""
+        frequency, phase = self.memory["frequency"], self.memory["phase"]
+        states, inputs = world.x.T, u.T
+        angle = frequency * world.t[:, None, None, None] + phase
+        velocity = (self._amplitude * np.sin(angle)).sum(axis=-1)
+        route = self.memory["start"] + (self._amplitude * (np.cos(phase) - np.cos(angle)) / frequency).sum(axis=-1)
+        velocity += POSITION_GAIN * (route - states[:, self._positions])
+        fleet = world.fleet
+        for number, i in enumerate(self.leader_indices):
+            own = states[:, fleet.state_slice(i)]
+            inputs[:, fleet.input_slice(i)] = velocity_to_input(fleet.models[i], own, velocity[:, number])
+
+    def signature(self, world: World) -> Signature:
+        """Leaders with their speeds, and everything that edges say."""
+        ids = world.fleet.ids
+        leaders = [f"{ids[i]} at {speed} m/s" for i, speed in zip(self.leader_indices, self.speeds, strict=True)]
+        found = super().signature(world)
+        return {"tasks": found.pop("tasks"), "leaders": tuple(leaders), **found}
+
+
+def _speed(model: AgentModel) -> float:
+    """What a leader of this model can follow smoothly, in m/s rms."""
+    limits = [limit for limit, unit in zip(model.input_limit, model.inputs.values(), strict=True) if unit == "m/s"]
+    return 0.5 * min(limits) if limits and math.isfinite(min(limits)) else 0.5
+
+
+def _choose_leaders(
+    fleet: Fleet, hops: Sequence[Mapping[int, int]], leaders: int | Sequence[str | int] | None
+) -> list[int]:
+    if leaders is not None and not isinstance(leaders, int | np.integer):
+        if isinstance(leaders, str):
+            leaders = [leaders]
+        return sorted({fleet.agent(one) for one in leaders})
+    most = len(fleet) - 1
+    if leaders is not None and not 1 <= leaders <= most:
+        raise ValueError(f"leaders must be 1 to {most} of {len(fleet)} agents, or a list of ids; got {leaders!r}")
+    far = [{j for j, distance in reached.items() if distance >= 2} for reached in hops]
+    waiting = set(range(len(fleet)))
+    chosen: list[int] = []
+    rest = list(range(len(fleet)))
+    while len(chosen) < (most if leaders is None else leaders):
+        if leaders is None and len(chosen) >= min(2, most) and not any(waiting & far[i] for i in rest):
+            break
+        # the fastest first, and of these the one that most followers still wait for
+        best = max(rest, key=lambda i: (_speed(fleet.models[i]), len(waiting & far[i]), -i))
+        chosen.append(best)
+        rest.remove(best)
+        waiting -= {best} | far[best]
+    return sorted(chosen)
+
+
+def _assign_followers(
+    fleet: Fleet, hops: Sequence[Mapping[int, int]], leaders: Sequence[int], follow: dict[str, str]
+) -> list[tuple[int, int]]:
+    names = [fleet.ids[i] for i in leaders]
+    followers = [name for i, name in enumerate(fleet.ids) if i not in leaders]
+    for follower, leader in follow.items():
+        if follower not in followers:
+            raise ValueError(f"follow: {follower!r} isn't a follower; {did_you_mean(follower, followers)}")
+        if leader not in names:
+            raise ValueError(f"follow: {leader!r} isn't a leader; {did_you_mean(leader, names)}")
+    load = dict.fromkeys(leaders, 0)
+    pairs = []
+    for name in followers:
+        i = fleet.agent(name)
+        known = {j: hops[i][j] for j in leaders if j in hops[i]}
+        if name in follow:
+            j = fleet.agent(follow[name])
+            if j not in known:
+                raise ValueError(f"follow: {name!r} knows nothing of {follow[name]!r}, which is more than k hops away")
+        elif not known:
+            raise ValueError(
+                f"no leader within k hops of {name!r}; name more leaders (now {', '.join(names)}) or take a larger k"
+            )
+        else:  # out of earshot if there is one, then the nearest, then the one with fewer followers
+            j = min(known, key=lambda j: (known[j] < 2, known[j], load[j], j))
+        load[j] += 1
+        pairs.append((i, j))
+    return pairs
