@@ -90,6 +90,7 @@ class Simulator:
         if batch < 1:
             raise ValueError(f"batch must be at least 1; got {batch!r}")
         self.design, self.fleet, self.initial, self.batch = design, design.fleet, initial, batch
+        self.disturbance = disturbance
         bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` sees where it starts
         design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         self.integrator: Integrator = copy.copy(integrator or Proximal())  # its buffers are this simulator's own
