@@ -35,12 +35,12 @@ def contract(
     Exits with 1 if a check fails. Any PettingZoo ParallelEnv will do; what doesn't apply to it is skipped, with the
     reason.
     """
-    with mistakes():
+    with mistakes(), contextlib.redirect_stdout(sys.stderr):  # what the environment prints isn't part of the report
         from khop_env.testing import check_environment
 
         made, name = _maker(environment, scenario)
-        with Progress(f"checking {name}") as progress, contextlib.redirect_stdout(sys.stderr):
-            left_out = [part.strip() for part in skip.split(",") if part.strip()]
+        left_out = [part.strip() for part in skip.split(",") if part.strip()]
+        with Progress(f"checking {name}") as progress:
             report = check_environment(made, steps=steps, seed=seed, skip=left_out, progress=progress)
     if as_json:
         print_json({"ok": report.ok, **dataclasses.asdict(report)})

@@ -80,12 +80,14 @@ def check_environment(
 
 def _result(check: Callable[[Subject], str | None], subject: Subject) -> tuple[Status, str]:
     try:
-        return "passed", check(subject) or ""
+        try:
+            detail = check(subject)
+        finally:
+            subject.close()
     except Skip as reason:
         return "skipped", str(reason)
     except Fault as fault:
         return "failed", str(fault)
     except Exception as error:
         return "failed", described(error)
-    finally:
-        subject.close()
+    return "passed", detail or ""

@@ -9,6 +9,7 @@ import numpy as np
 
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv
 from khop_env.simulation import Simulator
+from khop_env.testing.equality import difference
 from khop_env.testing.subject import Fault, Subject
 
 _COPIES = 3
@@ -66,21 +67,8 @@ def _flat(env: KHopEnv, observations: dict[str, Any], *others: dict[str, Any]) -
 
 
 def _same(view: str, number: int, name: str, found: Any, expected: Any) -> None:
-    found, expected = np.asarray(found).reshape(-1), np.asarray(expected).reshape(-1)
-    if found.dtype == expected.dtype and found.tobytes() == expected.tobytes():
-        return
-    where = "" if found.shape != expected.shape else f", entry {np.flatnonzero(found != expected)[:1]}"
-    raise Fault(
-        f"{view}, step {number}: {name} differ from those of single environments{where}: {_few(found, expected)} "
-        f"instead of {_few(expected, found)}"
-    )
-
-
-def _few(values: Any, others: Any) -> str:
-    if values.shape != others.shape:
-        return f"{len(values)} entries"
-    place = np.flatnonzero(values != others)[:1]
-    return str(values[place[0]]) if len(place) else f"{values.dtype}"
+    if text := difference(np.asarray(expected).reshape(-1), np.asarray(found).reshape(-1), name):
+        raise Fault(f"step {number}, single environments, then {view}: {text}")
 
 
 def _rows(steps: list[dict[str, Any]], name: str) -> Any:
@@ -89,18 +77,18 @@ def _rows(steps: list[dict[str, Any]], name: str) -> Any:
 
 def _batched(env: BatchedEnv, expected: list[Any], actions: Any, seeds: list[int]) -> None:
     def same(number: int, steps: list[dict[str, Any]], observations: Any, infos: Any) -> None:
-        _same("batch", number, "observations", observations, _rows(steps, "observations"))
+        _same("as a batch", number, "observations", observations, _rows(steps, "observations"))
         for key, values in infos.items():
-            _same("batch", number, f"infos[{key!r}]", values, _rows(steps, key))
+            _same("as a batch", number, f"infos[{key!r}]", values, _rows(steps, key))
 
     same(0, [run[0] for run in expected], *env.reset(seeds))
     for number, action in enumerate(actions, start=1):
         steps = [run[number] for run in expected]
         observations, rewards, terminated, truncated, infos = env.step(action)
         same(number, steps, observations, infos)
-        _same("batch", number, "rewards", rewards, _rows(steps, "rewards"))
+        _same("as a batch", number, "rewards", rewards, _rows(steps, "rewards"))
         for name, flags in (("terminations", terminated), ("truncations", truncated)):
-            _same("batch", number, name, np.repeat(flags, len(env.agents)), _rows(steps, name))
+            _same("as a batch", number, name, np.repeat(flags, len(env.agents)), _rows(steps, name))
         over = [b for b, step in enumerate(steps) if "next" in step]
         if over:
             observations, infos = env.reset(copies=over)
@@ -109,31 +97,37 @@ def _batched(env: BatchedEnv, expected: list[Any], actions: Any, seeds: list[int
 
 def _vector(batched: BatchedEnv, expected: list[Any], actions: Any, seeds: list[int]) -> None:
     env = KHopVectorEnv(batched, name="")
-    _same("vector", 0, "observations", env.reset(seed=seeds)[0], _rows([run[0] for run in expected], "observations"))
+    _same(
+        "as a vector environment",
+        0,
+        "observations",
+        env.reset(seed=seeds)[0],
+        _rows([run[0] for run in expected], "observations"),
+    )
     for number, action in enumerate(actions, start=1):
         steps = [run[number] for run in expected]
         rows, *flat, infos = env.step(action.reshape(env.action_space.shape))
         after = [step.get("next", step) for step in steps]
-        _same("vector", number, "observations", rows, _rows(after, "observations"))
+        _same("as a vector environment", number, "observations", rows, _rows(after, "observations"))
         for name, values in zip(("rewards", "terminations", "truncations"), flat, strict=True):
-            _same("vector", number, name, values, _rows(steps, name))
+            _same("as a vector environment", number, name, values, _rows(steps, name))
         over = [step for step in steps if "next" in step]
         if over:
             final = [row for row in infos["final_obs"] if row is not None]
-            _same("vector", number, "final_obs", np.concatenate(final), _rows(over, "observations"))
+            _same("as a vector environment", number, "final_obs", np.concatenate(final), _rows(over, "observations"))
 
 
 def _joint(inner: KHopEnv, expected: list[Any], actions: Any, seed: int) -> None:
     env = JointEnv(inner)
-    _same("team", 0, "observations", env.reset(seed=seed)[0], expected[0]["observations"])
+    _same("with the team as one agent", 0, "observations", env.reset(seed=seed)[0], expected[0]["observations"])
     for number, (action, step) in enumerate(zip(actions, expected[1:], strict=True), start=1):
         observation, reward, terminated, truncated, _ = env.step(action)
-        _same("team", number, "observations", observation, step["observations"])
-        _same("team", number, "reward", reward, step["rewards"].mean())
-        _same("team", number, "terminated", terminated, step["terminations"].all())
-        _same("team", number, "truncated", truncated, step["truncations"].all())
+        _same("with the team as one agent", number, "observations", observation, step["observations"])
+        _same("with the team as one agent", number, "reward", reward, step["rewards"].mean())
+        _same("with the team as one agent", number, "terminated", terminated, step["terminations"].all())
+        _same("with the team as one agent", number, "truncated", truncated, step["truncations"].all())
         if "next" in step:
-            _same("team", number, "observations", env.reset()[0], step["next"]["observations"])
+            _same("with the team as one agent", number, "observations", env.reset()[0], step["next"]["observations"])
 
 
 def _sb3(batched: BatchedEnv, expected: list[Any], actions: Any, seed: int) -> None:
@@ -141,17 +135,17 @@ def _sb3(batched: BatchedEnv, expected: list[Any], actions: Any, seed: int) -> N
 
     env, agents = KHopSB3VecEnv(batched), len(batched.agents)
     env.seed(seed)
-    _same("SB3", 0, "observations", env.reset(), _rows([run[0] for run in expected], "observations"))
+    _same("as an SB3 VecEnv", 0, "observations", env.reset(), _rows([run[0] for run in expected], "observations"))
     for number, action in enumerate(actions, start=1):
         steps = [run[number] for run in expected]
         rows, rewards, dones, infos = env.step(action.reshape(env.num_envs, -1))
         after = [step.get("next", step) for step in steps]
-        _same("SB3", number, "observations", rows, _rows(after, "observations"))
-        _same("SB3", number, "rewards", rewards, _rows(steps, "rewards").astype(np.float32))
-        _same("SB3", number, "dones", dones, _rows(steps, "terminations") | _rows(steps, "truncations"))
+        _same("as an SB3 VecEnv", number, "observations", rows, _rows(after, "observations"))
+        _same("as an SB3 VecEnv", number, "rewards", rewards, _rows(steps, "rewards").astype(np.float32))
+        _same("as an SB3 VecEnv", number, "dones", dones, _rows(steps, "terminations") | _rows(steps, "truncations"))
         for row in np.flatnonzero(dones):
             step, agent = steps[row // agents], row % agents
             last = step["observations"].reshape(agents, -1)[agent]
-            _same("SB3", number, "terminal_observation", infos[row]["terminal_observation"], last)
+            _same("as an SB3 VecEnv", number, "terminal_observation", infos[row]["terminal_observation"], last)
             limit = infos[row]["TimeLimit.truncated"]
-            _same("SB3", number, "TimeLimit.truncated", limit, step["truncations"][agent])
+            _same("as an SB3 VecEnv", number, "TimeLimit.truncated", limit, step["truncations"][agent])
