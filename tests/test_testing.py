@@ -258,6 +258,15 @@ def test_without_sb3_its_check_says_how_to_install_it(monkeypatch):
     assert report.ok
     assert report["sb3"].status == "skipped"
     assert "pip install 'khop_env[rl]'" in report["sb3"].detail
+    assert report["views"].detail == "not compared as an SB3 VecEnv: Stable-Baselines3 isn't installed"
+
+
+def test_ragged_observations_have_fewer_views():
+    report = check_environment(
+        partial(consensus_v0.parallel_env, "mixed_fleet", uniform=False, max_cycles=10), steps=20
+    )
+    assert statuses(report, "passed") == list(CHECKS), str(report)
+    assert report["views"].detail.startswith("ragged observations have no rows")
 
 
 @pytest.mark.parametrize(

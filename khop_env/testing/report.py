@@ -20,7 +20,7 @@ class Check:
         claim: what it checks, in a line.
         status: "passed", "failed" or "skipped".
         detail: of a failed one what was got, where, and what was expected; of a skipped one the reason; of a passed one
-            what a library warned of, mostly nothing.
+            what a library warned of or what couldn't be compared, mostly nothing.
     """
 
     name: str
