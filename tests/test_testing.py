@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from pettingzoo.utils import parallel_to_aec
-from walkers import FAULTS, HORIZON, LikeMpe2, Siamese, Walkers
+from walkers import FAULTS, HORIZON, Buffered, LikeMpe2, Siamese, Walkers
 
 import khop_env
 from khop_env import consensus_v0, leader_following_v0
@@ -66,6 +66,21 @@ def test_flags_that_are_no_flags():
 
     detail = check_environment(Unflagged)["episode_end"].detail
     assert detail == "call 1, step(): terminations must be True or False for 'walker_0'; got 0.0"
+
+
+def test_noise_is_found_although_buffers_are_written_again():
+    """Comparisons are of what was returned, not of what stands there at the end."""
+
+    class NoisyStart(Buffered):
+        def observe_all(self):
+            seen = super().observe_all()
+            if self.t == 1:
+                seen["walker_0"] += np.random.default_rng().uniform(0.0, 1e-6, 2).astype(np.float32)
+            return seen
+
+    report = check_environment(NoisyStart, steps=HORIZON)  # the last observation has no noise
+    assert statuses(report, "failed") == ["same_seed", "memory"], str(report)
+    assert report["same_seed"].detail.startswith("call 1, step(): observations['walker_0']")
 
 
 def test_instances_that_share_a_generator():
