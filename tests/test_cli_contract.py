@@ -39,7 +39,7 @@ def test_an_environment_by_name():
 
 @pytest.mark.parametrize("name", ["my_env", "my_env.py", "my_env:parallel_env", "my_env.py:instance"])
 def test_modules_files_functions_and_objects(name, folder):
-    """What the environment prints stays out of the JSON."""
+    """Prints of the environment stay out of the JSON."""
     found = only_json(khop("test", name, "--json"))
     assert found["ok"]
     assert found["environment"] == "walkers"

@@ -232,7 +232,7 @@ class NewSpaces(Walkers):
 
 
 class LikeMpe2(Walkers):
-    """What MPE2 and PettingZoo's tests let pass: noise of NumPy's generator, and nan outside the Box now and then."""
+    """Faults that MPE2 and PettingZoo's tests let pass: noise of NumPy's generator, nan outside the Box."""
 
     def noise(self):
         return 0.1 * np.random.uniform(-1.0, 1.0, 2)  # noqa: NPY002

@@ -1,4 +1,4 @@
-"""Who knows what: nobody observes what the agent can't know, in environments of this library."""
+"""No agent of this library's environments observes what it can't know."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _VISIBLE = ("t", "x", "estimate")  # of the simulator's state: observations are 
 
 
 def leak(subject: Subject) -> None:
-    """Nobody observes what the agent can't know."""
+    """No agent observes what it can't know."""
     env = subject.own()
     for number, seen in enumerate(play(env, 4, subject.seed, reset_seed=subject.seed)):
         for agent, observation in seen["observations"].items():
@@ -46,7 +46,7 @@ def leak(subject: Subject) -> None:
 
 
 def changed_by(env: KHopEnv, write: Callable[[EnvState], None]) -> dict[int, int]:
-    """Whose observation changes with the environment's state.
+    """Agents whose observation changes with the environment's state.
 
     Args:
         env: in mid-episode; its state stays as it is.

@@ -29,7 +29,7 @@ def pettingzoo(subject: Subject) -> str:
     with warnings.catch_warnings():  # the import makes example environments in a way that PettingZoo itself deprecates
         warnings.simplefilter("ignore", DeprecationWarning)
         from pettingzoo.test import api_test, parallel_api_test
-    with _heard(subject) as notes:
+    with _collected(subject) as notes:
         parallel_api_test(subject.any(), num_cycles=subject.steps)
         api_test(parallel_to_aec(subject.any()), num_cycles=subject.steps)
     return "; ".join(notes)
@@ -40,7 +40,7 @@ def pettingzoo_seeds(subject: Subject) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         from pettingzoo.test import parallel_seed_test, seed_test
-    with _heard(subject) as notes:
+    with _collected(subject) as notes:
         parallel_seed_test(subject.another, num_cycles=subject.steps)
         seed_test(lambda: parallel_to_aec(subject.another()), num_cycles=subject.steps)
     return "; ".join(notes)
@@ -50,7 +50,7 @@ def gymnasium(subject: Subject) -> str:
     """Gymnasium's check_env, with the team as one agent."""
     from gymnasium.utils.env_checker import check_env
 
-    with _heard(subject) as notes:
+    with _collected(subject) as notes:
         check_env(_team(subject), skip_render_check=True)
     return "; ".join(notes)
 
@@ -62,7 +62,7 @@ def sb3(subject: Subject) -> str:
         raise Skip("Stable-Baselines3 isn't installed: pip install 'khop_env[rl]'")
     from stable_baselines3.common.env_checker import check_env
 
-    with _heard(subject) as notes:
+    with _collected(subject) as notes:
         check_env(team)
     return "; ".join(notes)
 
@@ -74,14 +74,14 @@ def _team(subject: Subject) -> JointEnv:
 
 
 @contextlib.contextmanager
-def _heard(subject: Subject) -> Iterator[list[str]]:
+def _collected(subject: Subject) -> Iterator[list[str]]:
     """Collect warnings, each once, but for those that are meant so; and drop what is printed."""
     notes: list[str] = []
     expected = _ON_PURPOSE if isinstance(subject.env.unwrapped, KHopEnv) else ()
-    with warnings.catch_warnings(record=True) as heard, contextlib.redirect_stdout(io.StringIO()), np.errstate():
+    with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stdout(io.StringIO()), np.errstate():
         warnings.simplefilter("always")
         yield notes
-    for warning in heard:
+    for warning in caught:
         text = re.sub(r"\x1b\[\d+m", "", " ".join(str(warning.message).split()))
         if text not in notes and not any(re.match(pattern, text) for pattern in expected):
             notes.append(text)

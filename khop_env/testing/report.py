@@ -1,4 +1,4 @@
-"""What was checked, and what came of it."""
+"""Results of checks, and their table."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Whether no check failed; some may have been skipped."""
+        """True if no check failed; some may have been skipped."""
         return all(check.status != "failed" for check in self.checks)
 
     def __getitem__(self, name: str) -> Check:

@@ -86,7 +86,7 @@ def global_random(subject: Subject) -> None:
 
 
 def memory(subject: Subject) -> None:
-    """What was returned is the caller's, and stays so."""
+    """Returned arrays belong to the caller, and stay so."""
     env = subject.any()
     played = itertools.islice(play(env, _SHORT, subject.seed, reset_seed=subject.seed), 4)
     kept = {called(number, seen): seen for number, seen in enumerate(played)}
@@ -120,7 +120,7 @@ def deepcopied(subject: Subject) -> None:
 
 
 def _survives_writing(subject: Subject) -> None:
-    """Whoever writes into what was returned, or into actions, changes nothing."""
+    """Writing into what was returned, or into actions, changes nothing."""
     subject.require_repeatable()
     runs: list[list[dict[str, Any]]] = [[], []]
     for run, spoil in zip(runs, (False, True), strict=True):
@@ -178,5 +178,5 @@ def _overlap(first: Any, second: Any) -> bool:
 
 
 def _has_state(env: ParallelEnv) -> bool:
-    """Whether state() is there: PettingZoo's base class raises."""
+    """True if there is a state(): that of PettingZoo's base class raises."""
     return isinstance(getattr(env, "state_space", None), Space) or type(env).state is not ParallelEnv.state

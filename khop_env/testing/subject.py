@@ -54,7 +54,7 @@ class Subject:
 
     @property
     def name(self) -> str:
-        """What the report calls it."""
+        """Its name in the report."""
         return str(self.env) if type(self.env).__str__ is not object.__str__ else type(self.env).__name__
 
     def another(self) -> ParallelEnv:
@@ -174,7 +174,7 @@ def record(env: ParallelEnv, steps: int, seed: int, **arguments: Any) -> list[di
 
 
 def first_difference(run: list[dict[str, Any]], again: list[dict[str, Any]]) -> str | None:
-    """Where two recordings of the same play begin to differ."""
+    """The first difference between two recordings of the same play."""
     for number, (first, second) in enumerate(zip(run, again, strict=False)):
         for key in first:
             if found := difference(first[key], second.get(key), key):
@@ -183,7 +183,7 @@ def first_difference(run: list[dict[str, Any]], again: list[dict[str, Any]]) -> 
 
 
 def called(number: int, seen: dict[str, Any]) -> str:
-    """Which call it was: "call 3, step()"."""
+    """A call by its number: "call 3, step()"."""
     return f"call {number}, {'step' if 'rewards' in seen else 'reset'}()"
 
 

@@ -74,7 +74,7 @@ def nan_action(subject: Subject) -> None:
 
 
 def _out_of_space(env: ParallelEnv, seen: dict[str, Any]) -> str | None:
-    """What is outside its space or not finite in what a call returned."""
+    """The first value of a call's that is outside its space or not finite."""
     for agent in env.agents:
         if agent not in seen["observations"]:
             return f"no observation of {agent!r}"

@@ -59,7 +59,7 @@ def _by_agent(env: KHopEnv, flat: Any) -> dict[str, Any]:
 
 
 def _flat(env: KHopEnv, observations: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
-    """What reset or step returned, agents side by side."""
+    """The values of reset or step, agents side by side."""
     agents = env.possible_agents
     flat = {"observations": np.concatenate([observations[agent] for agent in agents])}
     for name, values in zip(("rewards", "terminations", "truncations"), others[:-1], strict=False):
