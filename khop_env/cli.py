@@ -1,7 +1,7 @@
 """The command line, `khop`.
 
 Tables and one JSON object (`--json`) go to stdout; progress and messages to stderr. Exit status: 0, or 1 where a check
-or a run finds the observers' guarantee broken, or 2 for a mistake in what was asked.
+or a run finds the observers' guarantee or the environments' contract broken, or 2 for a mistake in what was asked.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from khop_env.commands.evaluate import evaluate
 from khop_env.commands.iss import iss
 from khop_env.commands.run import run
 from khop_env.commands.scenarios import check, export, list_scenarios
+from khop_env.commands.test import contract
 from khop_env.commands.train import train
 from khop_env.commands.tune import tune
 from khop_env.terminal import say
@@ -41,6 +42,7 @@ app.command()(evaluate)
 app.command()(train)
 app.command()(tune)
 app.command()(iss)
+app.command("test")(contract)
 app.command()(bench)
 
 

@@ -89,6 +89,7 @@ class Simulator:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1; got {num_envs!r}")
         self.design, self.fleet, self.initial, self.num_envs = design, design.fleet, initial, num_envs
+        self.disturbance = disturbance
         bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` sees where it starts
         design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         self.observers: Observers = copy.copy(observers or Proximal())  # its buffers are this simulator's own

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
-from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
@@ -13,12 +12,14 @@ import gymnasium
 import numpy as np
 
 import khop_env
-from khop_env.env import BatchedEnv, KHopEnv
+from khop_env.env import SHARED_INFOS, BatchedEnv, KHopEnv
 from khop_env.registry import scenario
 from khop_env.scenarios import Scenario
+from khop_env.testing import CHECKS, check_environment, difference
 
 ENVIRONMENTS = khop_env.environments()
 SCENARIOS = ("paper", "convoy", "mixed_fleet", "random_geometric:agents=12")
+INFO_KEYS = ("task_error", *SHARED_INFOS)
 MODES = ("estimate", "oracle", "local")
 EVERY = list(itertools.product(ENVIRONMENTS, SCENARIOS))
 CROSS = list(itertools.product(ENVIRONMENTS, SCENARIOS, MODES, (True, False)))  # ..., observe, uniform
@@ -70,25 +71,17 @@ def play(env: KHopEnv, cycles: int, seed: int = 0, scale: float = 1.0) -> list[A
     return seen
 
 
-def same(one: Any, other: Any) -> bool:
+def same(first: Any, second: Any) -> bool:
     """Whether two nests of dicts, sequences, dataclasses, arrays and numbers are equal bit for bit, types included."""
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, np.ndarray):
-        if one.dtype == object:
-            return one.shape == other.shape and all(map(same, one.ravel().tolist(), other.ravel().tolist()))
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-    if isinstance(one, np.random.Generator):
-        return same(one.bit_generator.state, other.bit_generator.state)
-    if isinstance(one, Mapping):
-        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    if is_dataclass(one):
-        return all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
-    if type(one).__module__.startswith("khop_env"):
-        return same(vars(one), vars(other))
-    return one == other
+    return difference(first, second) is None
+
+
+def require_contract(make: Callable[[], Any], *checks: str, steps: int = 300) -> None:
+    """The public checks pass; those named, or all of them, run, and no library warns of anything."""
+    report = check_environment(make, steps=steps, skip=set(CHECKS) - set(checks or CHECKS))
+    report.raise_if_failed()
+    assert [check.name for check in report.checks if check.status == "passed"] == list(checks or CHECKS), str(report)
+    assert not any(check.detail for check in report.checks if check.status == "passed"), str(report)
 
 
 def state(env: KHopEnv | BatchedEnv) -> tuple[Any, ...]:
@@ -100,19 +93,7 @@ def state(env: KHopEnv | BatchedEnv) -> tuple[Any, ...]:
         saved.cycles,
         saved.over,
         saved.environment,
-        saved.routes,
+        saved.task,
         saved.generators,
         saved.seeded,
     )
-
-
-def arrays(value: Any) -> Iterator[np.ndarray]:
-    """All arrays in a nest."""
-    if isinstance(value, np.ndarray):
-        yield value
-        if value.dtype == object:
-            yield from (inner for one in value for inner in arrays(one))
-    elif isinstance(value, Mapping):
-        yield from (inner for one in value.values() for inner in arrays(one))
-    elif isinstance(value, list | tuple):
-        yield from (inner for one in value for inner in arrays(one))

@@ -6,25 +6,15 @@ from types import SimpleNamespace
 
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
-from playing import CROSS, IDS, aec, built, joint, parallel
+from playing import CROSS, IDS, aec, built, joint, parallel, require_contract
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from khop_env.env.rendering import canvas
 
 with warnings.catch_warnings():  # the import makes example environments in a way that PettingZoo itself deprecates
     warnings.filterwarnings("ignore", "The old environment creation API", DeprecationWarning)
-    from pettingzoo.test import (
-        api_test,
-        max_cycles_test,
-        parallel_api_test,
-        parallel_seed_test,
-        render_test,
-        seed_test,
-        state_test,
-    )
+    from pettingzoo.test import max_cycles_test, render_test, state_test
 
-FOREIGN_OPTION = "ignore:reset\\(\\) ignores the option 'options':UserWarning"  # PettingZoo's tests give one
-RAGGED = "ignore:(Agents have different observation space sizes|Observations are different shapes):UserWarning"
 # padding is always zero
 PADDING = "ignore:(.*A Box observation space|Agent's) maximum and minimum .*values are equal:UserWarning"
 
@@ -39,23 +29,11 @@ def no_screen(monkeypatch):
 cross = pytest.mark.parametrize(("environment", "name", "observe", "uniform"), CROSS)
 
 
-@pytest.mark.filterwarnings(FOREIGN_OPTION)
 @cross
-def test_parallel_api(environment, name, observe, uniform):
-    parallel_api_test(parallel(environment, name, observe=observe, uniform=uniform, max_cycles=4), num_cycles=6)
-
-
-@pytest.mark.filterwarnings(FOREIGN_OPTION, RAGGED, PADDING)
-@cross
-def test_aec_api(environment, name, observe, uniform):
-    api_test(aec(environment, name, observe=observe, uniform=uniform, max_cycles=4), num_cycles=6)
-
-
-@cross
-def test_seeds(environment, name, observe, uniform):
-    arguments = {"observe": observe, "uniform": uniform, "max_cycles": 20}
-    parallel_seed_test(partial(parallel, environment, name, **arguments), num_cycles=3)
-    seed_test(partial(aec, environment, name, **arguments), num_cycles=3)
+def test_pettingzoo(environment, name, observe, uniform):
+    """Its tests of both forms, and of seeds."""
+    make = partial(parallel, environment, name, observe=observe, uniform=uniform, max_cycles=4)
+    require_contract(make, "pettingzoo", "pettingzoo_seeds", steps=6)
 
 
 @cross

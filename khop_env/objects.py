@@ -1,0 +1,120 @@
+"""Python objects by name, as a user writes them where the command line takes one: `my_module:make_env`."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+import traceback
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+_LISTED = 8  # names of a module, in an error
+
+
+def load_object(name: str) -> Any:
+    """An attribute of a module or of a file, or the module itself.
+
+        load_object("my_module:make_env")
+        load_object("path/to/my_file.py:Configuration.make")
+        load_object("mpe2.simple_spread_v3")
+
+    Modules are looked for among what is installed and in the working directory. A file becomes a module of its own
+    name, and its folder is searched too, so that it can import what lies beside it and its objects can be pickled.
+
+    Args:
+        name: "module:attribute", "file.py:attribute", or without the attribute.
+
+    Raises:
+        ValueError: if there is no such module, file or attribute, or if importing it raises; then with the file and the
+            line that it came from, and with the exception itself as the cause.
+    """
+    source, _, attribute = name.rpartition(":")
+    if not source or attribute.endswith(".py") or "/" in attribute or os.sep in attribute:  # a colon of the path's own
+        source, attribute = name, ""
+    found: Any = _file(source) if source.endswith(".py") else _module(source)
+    for part in filter(None, attribute.split(".")):
+        if not hasattr(found, part):
+            known = [one for one in vars(found) if not one.startswith("_")] if hasattr(found, "__dict__") else []
+            listed = ", ".join(known[-_LISTED:]) + (", ..." if len(known) > _LISTED else "")
+            owner = source if isinstance(found, ModuleType) else f"{source}: {getattr(found, '__name__', found)}"
+            raise ValueError(f"{owner} has no {part!r}; it has {listed or 'no public names'}")
+        found = getattr(found, part)
+    return found
+
+
+def described(error: BaseException, file: str = "") -> str:
+    """An exception and where it was raised: "ValueError: no such fleet (my_file.py, line 3, in make_env)".
+
+    Args:
+        error: the exception.
+        file: how the path of a file ends, whose last line that was under way is named instead of the last of all.
+    """
+    text = f"{type(error).__name__}: {error}"
+    if isinstance(error, SyntaxError) and error.filename is not None:
+        return f"{type(error).__name__}: {error.msg} ({_short(error.filename)}, line {error.lineno})"
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return text
+    frame = ([frame for frame in frames if frame.filename.endswith(file)] or frames)[-1]
+    return f"{text} ({_short(frame.filename)}, line {frame.lineno}, in {frame.name})"
+
+
+def _short(filename: str) -> str:
+    """A path as seen from the working directory, or from where packages are installed."""
+    path = Path(filename)
+    for folder in (*(parent for parent in path.parents if parent.name == "site-packages"), Path.cwd()):
+        if path.is_relative_to(folder):
+            return str(path.relative_to(folder))
+    return filename
+
+
+def _module(name: str) -> ModuleType:
+    """An installed module, or one in the working directory."""
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise ValueError(f"{name!r} names no Python object: write my_module:name or my_file.py:name")
+    _search(Path.cwd())
+    try:
+        return importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+            raise ValueError(
+                f"no module {error.name!r}, neither installed nor in the working directory; a file's name ends in .py"
+            ) from None
+        raise _raised(name, error, os.sep + name.replace(".", os.sep) + ".py") from error
+
+
+def _file(text: str) -> ModuleType:
+    """A file as a module."""
+    path = Path(text).resolve()
+    if not path.is_file():
+        raise ValueError(f"no file {text!r} (seen from {Path.cwd()})")
+    known = sys.modules.get(path.stem)
+    if known is not None:
+        if Path(getattr(known, "__file__", None) or "").resolve() == path:
+            return known
+        raise ValueError(f"{text}: a module named {path.stem!r} has been imported already; rename the file")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    _search(path.parent)
+    sys.modules[path.stem] = module
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[path.stem]
+        raise _raised(text, error, str(path)) from error
+    return module
+
+
+def _search(folder: Path) -> None:
+    """Let imports find what lies in a folder, after everything that is installed."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+
+
+def _raised(name: str, error: BaseException, file: str) -> ValueError:
+    return ValueError(f"importing {name} raised {described(error, file)}")
