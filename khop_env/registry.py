@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from khop_env.env import BatchedEnv, JointEnv, KHopVectorEnv, Settings, Task
 from khop_env.physics import did_you_mean
@@ -47,18 +48,22 @@ def environments() -> tuple[str, ...]:
     return ENVIRONMENTS
 
 
-def make_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopVectorEnv:
+def make_vec(
+    environment: str, num_envs: int = 1, *, autoreset_mode: str | AutoresetMode | None = None, **arguments: Any
+) -> KHopVectorEnv:
     """A Gymnasium vector environment over the batched simulator.
 
     Args:
         environment: one of `environments()`.
         num_envs: copies B; with N agents the vector environment has B * N rows.
+        autoreset_mode: "same_step" (default), "next_step" or "disabled", as `KHopVectorEnv` describes them.
         arguments: those of the environment's `parallel_env`, without render_mode.
 
     Raises:
         ValueError: for an unknown environment or scenario, naming the nearest, or a wrong argument.
     """
-    return KHopVectorEnv(environment_module(environment).batched_env(num_envs=num_envs, **arguments), name=environment)
+    batched = environment_module(environment).batched_env(num_envs=num_envs, **arguments)
+    return KHopVectorEnv(batched, name=environment, autoreset_mode=autoreset_mode)
 
 
 def make_sb3_vec(environment: str, num_envs: int = 1, **arguments: Any) -> KHopSB3VecEnv:

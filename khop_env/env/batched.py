@@ -119,11 +119,13 @@ class BatchedEnv:
         self._clipped_actions[which] = 0
         return self._observed(self._judge()[1])
 
-    def step(self, actions: ArrayLike) -> Step:
+    def step(self, actions: ArrayLike, ended: NDArray[np.bool_] | None = None) -> Step:
         """Advance all copies by one control period.
 
         Args:
             actions: (B, N, m) or (B, A), in [-1, 1]; what is outside is clipped, padded entries are ignored.
+            ended: (B,) copies whose episode may be over already. They are stepped with the others, what is returned for
+                them means nothing, and the caller resets them.
 
         Returns:
             Observations, rewards (B, N), terminated (B,), truncated (B,), infos (arrays (B, N)).
@@ -133,8 +135,8 @@ class BatchedEnv:
                 changed.
             SolveError: if a state becomes infinite.
         """
-        if self._over.any():
-            over = np.flatnonzero(self._over)
+        over = np.flatnonzero(self._over if ended is None else self._over & ~ended)
+        if over.size:
             raise ValueError(
                 f"no episode is running in {len(over)} of {self.batch} copies, the first {over[0]}: call reset() first"
             )
@@ -160,6 +162,11 @@ class BatchedEnv:
     def over(self) -> NDArray[np.bool_]:
         """(B,) whether a copy's episode has ended, or none has begun."""
         return self._over.copy()
+
+    @property
+    def begun(self) -> NDArray[np.bool_]:
+        """(B,) whether a copy was ever reset."""
+        return np.array([generator is not None for generator in self._generators])
 
     def task_errors(self) -> FloatArray:
         """(B, N) each agent's root mean square error along its task edges now, in m."""
