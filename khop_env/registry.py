@@ -100,6 +100,9 @@ def make_joint(environment: str, render_mode: str | None = None, **arguments: An
     return JointEnv(environment_module(environment).parallel_env(render_mode=render_mode, **arguments))
 
 
+make_joint.metadata = JointEnv.metadata  # type: ignore[attr-defined]  # where gymnasium.make looks for render modes
+
+
 def assemble(
     scenario_or_name: Scenario | str | Path,
     task: Callable[[Scenario], Task],
@@ -122,8 +125,8 @@ def assemble(
     """
     if "render_mode" in arguments:
         raise TypeError(
-            f"batches aren't rendered, and take no render_mode; got {arguments['render_mode']!r}: give it to the "
-            "environment's parallel_env, which is one copy"
+            "got an unexpected keyword argument 'render_mode': batches aren't rendered; give it to the environment's "
+            "parallel_env, which is one copy"
         )
     settings = Settings.of(arguments, ("scenario", "num_envs", "render_mode", *others))
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +43,6 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         batched: the environment as arrays.
 
     Raises:
-        ModuleNotFoundError: for a render mode without pygame-ce.
         ValueError: for an unknown render mode, or several copies.
     """
 
@@ -57,7 +57,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self.metadata = {
             "name": name,
             "render_modes": list(RENDER_MODES),
-            "render_fps": round(1.0 / batched.settings.control_period),
+            "render_fps": 1.0 / batched.settings.control_period,
             "is_parallelizable": True,
         }
         self.batched, self.render_mode = batched, render_mode
@@ -167,6 +167,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         """A frame (H, W, 3) in mode "rgb_array"; shows it in mode "human".
 
         Raises:
+            ModuleNotFoundError: without pygame-ce.
             ValueError: without a render mode, or before the first reset.
         """
         if self._renderer is None:
@@ -231,7 +232,10 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self.agents = [] if self.batched.over[0] else list(self.possible_agents)
         self._remember(begins=begins)
         if self._renderer is not None and self.render_mode == "human":
-            self._draw(self._renderer)
+            try:
+                self._draw(self._renderer)
+            except Exception as error:  # whatever is wrong with a display, the step has been made: return its results
+                warnings.warn(f"the window isn't drawn: {error}", RuntimeWarning, stacklevel=3)
         rows = zip(*(infos[key][0].tolist() for key in INFO_KEYS), strict=True)
         return {agent: dict(zip(INFO_KEYS, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
 

@@ -102,7 +102,7 @@ class Settings:
         known = [one.name for one in dataclasses.fields(cls)]
         for name in arguments:
             if name not in known:
-                raise TypeError(f"no argument {name!r}; {did_you_mean(name, [*others, *known])}")
+                raise TypeError(f"got an unexpected keyword argument {name!r}; {did_you_mean(name, [*others, *known])}")
         return cls(**arguments)
 
     @property

@@ -94,7 +94,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
             chosen = self._copies(options.pop("reset_mask"))
         which = np.flatnonzero(chosen)
         if isinstance(seed, Sequence) and len(seed) == batched.batch:
-            seed = [seed[b] for b in which]
+            seed = [seed[b] for b in which.tolist()]
         states = initial_states(batched.fleet, options)
         if states is not None and states.shape == (batched.batch, batched.fleet.n):
             states = states[which]
@@ -159,7 +159,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
                 f"option reset_mask: rows {b * agents} to {b * agents + agents - 1} are the agents of copy {b}, which "
                 f"are reset together: mask all or none; got {of_copy[b].tolist()}"
             )
-        return of_copy.all(axis=1)
+        return np.asarray(of_copy.all(axis=1))
 
     def _described(self, infos: Infos, rows: NDArray[np.bool_]) -> dict[str, Any]:
         """Infos in Gymnasium's form: an array per key, and which rows have it; 0 in the others."""

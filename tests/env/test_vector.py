@@ -270,7 +270,7 @@ def test_a_step_before_the_first_reset_is_refused(mode):
         ({"environment": "consensus_v1"}, ValueError, "no environment 'consensus_v1'; did you mean 'consensus_v0'"),
         ({"environment": "leader_folowing_v0"}, ValueError, "did you mean 'leader_following_v0'"),
         ({"scenario": "papr"}, ValueError, "no scenario 'papr'; did you mean 'paper'"),
-        ({"max_cycle": 3}, TypeError, "no argument 'max_cycle'; did you mean 'max_cycles'"),
+        ({"max_cycle": 3}, TypeError, "got an unexpected keyword argument 'max_cycle'; did you mean 'max_cycles'"),
         ({"autoreset_mode": "nextstep"}, ValueError, "must be 'same_step', 'next_step', 'disabled' .* got 'nextstep'"),
         ({"num_envs": 0}, ValueError, "num_envs must be a positive integer; got 0"),
     ],

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.env.rendering.camera import Camera, Labels
-from khop_env.env.rendering.canvas import Canvas, Window, load_pygame
+from khop_env.env.rendering.canvas import Canvas, Window
 from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import (
     EDGE_COLOR,
@@ -54,7 +54,6 @@ class Renderer:
         observer: index of the agent whose beliefs are shown.
 
     Raises:
-        ModuleNotFoundError: without pygame-ce.
         ValueError: for an observer or leader that isn't an agent.
     """
 
@@ -68,7 +67,6 @@ class Renderer:
         title: str = "",
         size: tuple[int, int] = (900, 720),
     ) -> None:
-        load_pygame()
         fleet, agents = design.fleet, len(design.fleet)
         self._fleet, self._title, self._size = fleet, title, size
         self._leaders = frozenset(fleet.agent(leader) for leader in leaders)
@@ -140,6 +138,9 @@ class Renderer:
 
         Returns:
             (H, W, 3) pixels, a fresh array.
+
+        Raises:
+            ModuleNotFoundError: without pygame-ce.
         """
         return self._draw(t, x, estimates, normalized, task_error).array()
 
@@ -156,6 +157,9 @@ class Renderer:
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
             task_error: in m, if there is one to show.
+
+        Raises:
+            ModuleNotFoundError: without pygame-ce.
         """
         if self._dismissed:
             return
