@@ -104,7 +104,8 @@ def test_options_of_each_row_reach_its_copy():
     env, clean = sb3(), sb3()
     options = [{} for _ in range(env.num_envs)]
     options[8 + 3] = {"initial_state": {"drifter_3": [0.5, -0.25]}}
-    options[8 + 4] = {"initial_state": {"drifter_4": [0.1, 0.2], "drifter_3": [0.5, -0.25]}}
+    options[8 + 4] = {"initial_state": {"drifter_4": [0.1, 0.2]}}
+    options[8 + 5] = {"initial_state": {"drifter_3": [0.5, -0.25]}}  # said twice, but the same
     options[15] = None
     for one in (env, clean):
         one.seed(3)
