@@ -31,7 +31,10 @@ def test_rows_are_those_of_the_gymnasium_environment(environment, name):
     """Observations, rewards and ends bit for bit (rewards as float32), in SB3's conventions."""
     radius = {"consensus_v0": 1.9, "formation_v0": 2.3, "leader_following_v0": 2.0}[environment]
     arguments = {"max_cycles": 5, "success_radius": radius * (3.0 if name == "mixed_fleet" else 1.0)}
-    env, other = sb3(environment, name, **arguments), make_vec(environment, COPIES, scenario=built(name), **arguments)
+    env, other = (
+        sb3(environment, name, **arguments),
+        make_vec(environment, COPIES, autoreset_mode="same_step", scenario=built(name), **arguments),
+    )
     env.seed(4)
     assert env.reset().tobytes() == other.reset(seed=4)[0].tobytes()
     for actions in actions_for(env, 12):
