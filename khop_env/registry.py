@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 import khop_env.tasks
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
@@ -85,15 +86,15 @@ def make_batched(
         raise TypeError(f"expected an environment's name or a Task; got {environment!r} ({type(environment).__name__})")
     if "render_mode" in arguments:
         raise TypeError(
-            f"batches aren't rendered, and take no render_mode; got {arguments['render_mode']!r}: give it to the "
-            "environment's parallel_env, which is one copy"
+            "got an unexpected keyword argument 'render_mode': batches aren't rendered; give it to the environment's "
+            "parallel_env, which is one copy"
         )
     of_settings = [field.name for field in dataclasses.fields(Settings)]
     of_task = list(_task_parameters(task)) if isinstance(task, type) else []
     for name in arguments:
         if name not in (*of_settings, *of_task):
             known = [*of_task, *of_settings, "scenario", "num_envs", "render_mode"]
-            raise TypeError(f"no argument {name!r}; {did_you_mean(name, known)}")
+            raise TypeError(f"got an unexpected keyword argument {name!r}; {did_you_mean(name, known)}")
     settings = Settings(**{name: value for name, value in arguments.items() if name in of_settings})
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ValueError(f"num_envs must be a positive integer; got {num_envs!r}")
@@ -151,12 +152,15 @@ def make_aec(
     return parallel_to_aec(make(environment, scenario, render_mode=render_mode, **arguments))
 
 
-def make_vec(environment: Environment, num_envs: int = 1, **arguments: Any) -> KHopVectorEnv:
+def make_vec(
+    environment: Environment, num_envs: int = 1, *, autoreset_mode: str | AutoresetMode | None = None, **arguments: Any
+) -> KHopVectorEnv:
     """A Gymnasium vector environment over the batched simulator.
 
     Args:
         environment: one of `environments()`, or a task of your own.
         num_envs: copies B; with N agents the vector environment has B * N rows.
+        autoreset_mode: "same_step" (default), "next_step" or "disabled", as `KHopVectorEnv` describes them.
         arguments: those of `make`, without render_mode.
 
     Raises:
@@ -164,7 +168,7 @@ def make_vec(environment: Environment, num_envs: int = 1, **arguments: Any) -> K
         ValueError: as `make`.
     """
     batched = make_batched(environment, num_envs=num_envs, **arguments)
-    return KHopVectorEnv(batched, name=batched.task.environment)
+    return KHopVectorEnv(batched, name=batched.task.environment, autoreset_mode=autoreset_mode)
 
 
 def make_sb3_vec(environment: Environment, num_envs: int = 1, **arguments: Any) -> KHopSB3VecEnv:
@@ -200,6 +204,9 @@ def make_joint(environment: Environment, render_mode: str | None = None, **argum
         ValueError: as `make`.
     """
     return JointEnv(make(environment, render_mode=render_mode, **arguments))
+
+
+make_joint.metadata = JointEnv.metadata  # type: ignore[attr-defined]  # where gymnasium.make looks for render modes
 
 
 def spelled_out(task: type[Task]) -> Callable[[Function], Function]:

@@ -142,11 +142,13 @@ class BatchedEnv:
         self.task.reset(self.world, chosen, generators)
         return self._observed(self._evaluate())
 
-    def step(self, actions: ArrayLike) -> Step:
+    def step(self, actions: ArrayLike, ended: NDArray[np.bool_] | None = None) -> Step:
         """Advance all copies by one control period.
 
         Args:
             actions: (B, N, m) or (B, A), in [-1, 1]; what is outside is clipped, padded entries are ignored.
+            ended: (B,) copies whose episode may be over already. They are stepped with the others, what is returned for
+                them means nothing, and the caller resets them.
 
         Returns:
             Observations, rewards (B, N), terminated (B,), truncated (B,), infos (arrays (B, N)).
@@ -156,7 +158,7 @@ class BatchedEnv:
                 changed.
             SolveError: if a state becomes infinite.
         """
-        self._require_running()
+        self._require_running(ended)
         self._clipped_actions = self._actions.read(actions, self._command)
         self.simulator.restart_extremes()
         for number in range(self.settings.substeps):
@@ -176,6 +178,11 @@ class BatchedEnv:
     def over(self) -> NDArray[np.bool_]:
         """(B,) whether a copy's episode has ended, or none has begun."""
         return self._over.copy()
+
+    @property
+    def begun(self) -> NDArray[np.bool_]:
+        """(B,) whether a copy was ever reset."""
+        return np.array([generator is not None for generator in self._generators])
 
     def task_errors(self) -> FloatArray:
         """(B, N) each agent's task error now, in the task's unit."""
@@ -237,9 +244,9 @@ class BatchedEnv:
         drawn = np.array([self.simulator.initial.draw(copy.deepcopy(each)) for each in generators])
         return np.where(np.isnan(x0), drawn, x0)
 
-    def _require_running(self) -> None:
-        if self._over.any():
-            over = np.flatnonzero(self._over)
+    def _require_running(self, ended: NDArray[np.bool_] | None) -> None:
+        over = np.flatnonzero(self._over if ended is None else self._over & ~ended)
+        if over.size:
             raise ValueError(
                 f"no episode is running in {len(over)} of {self.num_envs} copies, the first {over[0]}: call reset() "
                 "first"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -35,6 +36,20 @@ def seeds(seed: int | Sequence[int | None] | None, copies: IntArray) -> list[int
     return given
 
 
+def reset_options(options: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The options, none by default.
+
+    Raises:
+        ValueError: if they aren't a mapping.
+    """
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(
+            f"options are a dictionary, as {{'initial_state': ...}}; got {reprlib.repr(options)} "
+            f"({type(options).__name__})"
+        )
+    return options or {}
+
+
 def initial_states(fleet: Fleet, options: Mapping[str, Any] | None) -> FloatArray | None:
     """Initial states from `options`; others are drawn.
 
@@ -44,9 +59,9 @@ def initial_states(fleet: Fleet, options: Mapping[str, Any] | None) -> FloatArra
     Unknown options are ignored with a warning, as PettingZoo's own tests ask for.
 
     Raises:
-        ValueError: for an unknown agent, or states of a wrong length or not finite.
+        ValueError: for options that aren't a mapping, an unknown agent, or states of a wrong length or not finite.
     """
-    options = options or {}
+    options = reset_options(options)
     for name in options:
         if name not in RESET_OPTIONS:
             warnings.warn(

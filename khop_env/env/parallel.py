@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import reprlib
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +44,6 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         batched: the environment as arrays.
 
     Raises:
-        ModuleNotFoundError: for a render mode without pygame-ce.
         ValueError: for an unknown render mode, or several copies.
     """
 
@@ -58,7 +58,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self.metadata = {
             "name": name,
             "render_modes": list(RENDER_MODES),
-            "render_fps": round(1.0 / batched.settings.control_period),
+            "render_fps": 1.0 / batched.settings.control_period,
             "is_parallelizable": True,
         }
         self.batched, self.render_mode = batched, render_mode
@@ -168,6 +168,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         """A frame (H, W, 3) in mode "rgb_array"; shows it in mode "human".
 
         Raises:
+            ModuleNotFoundError: without pygame-ce.
             ValueError: without a render mode, or before the first reset.
         """
         if self._renderer is None:
@@ -232,7 +233,10 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self.agents = [] if self.batched.over[0] else list(self.possible_agents)
         self._remember(begins=begins)
         if self._renderer is not None and self.render_mode == "human":
-            self._draw(self._renderer)
+            try:
+                self._draw(self._renderer)
+            except Exception as error:  # whatever is wrong with a display, the step has been made: return its results
+                warnings.warn(f"the window isn't drawn: {error}", RuntimeWarning, stacklevel=3)
 
     def _infos(self, infos: Infos) -> dict[str, dict[str, float]]:
         rows = zip(*(values[0].tolist() for values in infos.values()), strict=True)

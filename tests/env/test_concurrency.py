@@ -65,7 +65,17 @@ def play(env, seed):
 
 def episodes(seed, environment="consensus_v0", scenario="paper", copies=2, threads=1):
     """Those of a new environment; all environments of one process share the scenario and with it the observers."""
-    return play(make_vec(environment, copies, scenario=built(scenario), max_cycles=CYCLES, threads=threads), seed)
+    return play(
+        make_vec(
+            environment,
+            copies,
+            autoreset_mode="same_step",
+            scenario=built(scenario),
+            max_cycles=CYCLES,
+            threads=threads,
+        ),
+        seed,
+    )
 
 
 def joint():
@@ -111,7 +121,7 @@ def test_a_forked_environment_goes_on():
     """An environment whose threads were left behind in the parent continues bit for bit in the child, and the parent's
     own does so, too.
     """
-    env = make_vec("consensus_v0", 2, scenario=built("paper"), max_cycles=CYCLES, threads=2)
+    env = make_vec("consensus_v0", 2, autoreset_mode="same_step", scenario=built("paper"), max_cycles=CYCLES, threads=2)
     play(env, 0)
     ours, theirs = multiprocessing.Pipe()
     child = multiprocessing.get_context("fork").Process(target=lambda: theirs.send(play(env, 1)))

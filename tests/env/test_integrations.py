@@ -11,8 +11,12 @@ import pettingzoo
 import pytest
 import supersuit
 import torch
-from playing import ENVIRONMENTS, EVERY, IDS, aec, parallel, play, same
+from playing import ENVIRONMENTS, EVERY, IDS, aec, built, parallel, play, same
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+
+from khop_env import make_sb3_vec, make_vec
+from khop_env.env.rendering import canvas
 
 by_name = pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="PettingZoo makes by name from 1.26 on")
 
@@ -80,6 +84,56 @@ gymnasium.make("khop/Consensus-v0").reset(seed=0)
         command = [sys.executable, "-W", "error::UserWarning", "-c", script]
         found = subprocess.run(command, capture_output=True, text=True)
         assert found.returncode == 0, found.stderr
+
+
+class TestConstruction:
+    """Arguments that other libraries try, and what they make of our refusals."""
+
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda **wrong: gymnasium.make("khop/Consensus-v0", **wrong),
+            lambda **wrong: make_vec("consensus_v0", **wrong),
+            lambda **wrong: make_sb3_vec("consensus_v0", **wrong),
+            lambda **wrong: parallel("leader_following_v0", **wrong),
+            lambda **wrong: aec("formation_v0", **wrong),
+        ],
+        ids=["gymnasium", "vector", "sb3", "parallel", "aec"],
+    )
+    def test_unknown_arguments_are_refused_in_python_s_words(self, make):
+        """TorchRL's GymEnv tries frameskip, and leaves it out if it reads these words."""
+        with pytest.raises(TypeError, match="got an unexpected keyword argument 'frameskip'; known: scenario, "):
+            make(frameskip=1)
+
+    @pytest.mark.parametrize("make", [make_vec, make_sb3_vec])
+    def test_render_modes_of_batches_too(self, make):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'render_mode': batches aren't rendered"):
+            make("consensus_v0", render_mode="rgb_array")
+
+    def test_lists_of_frames(self):
+        """gymnasium.make collects them itself where the environment has render modes."""
+        env = gymnasium.make("khop/Consensus-v0", scenario=built("paper"), render_mode="rgb_array_list")
+        single = gymnasium.make("khop/Consensus-v0", scenario=built("paper"), render_mode="rgb_array")
+        frames = []
+        env.reset(seed=0)
+        single.reset(seed=0)
+        for _ in range(3):
+            frames.append(single.render())
+            for one in (env, single):
+                one.step(np.zeros(16, np.float32))
+        frames.append(single.render())
+        collected = env.render()
+        assert len(collected) == 4
+        assert all(np.array_equal(*pair) for pair in zip(collected, frames, strict=True))
+
+    def test_stable_baselines3_s_make_vec_env_without_pygame(self, monkeypatch):
+        """It asks for rgb_array by itself."""
+        canvas.load_pygame.cache_clear()
+        monkeypatch.setitem(sys.modules, "pygame", None)
+        env = make_vec_env("khop/Consensus-v0", n_envs=2, seed=0, env_kwargs={"scenario": built("paper")})
+        assert env.render_mode == "rgb_array"
+        assert env.reset().shape == (2, *env.observation_space.shape)
+        env.step(np.zeros((2, 16), np.float32))
 
 
 class TestSuperSuit:

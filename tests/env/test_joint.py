@@ -130,5 +130,5 @@ def test_steps_outside_an_episode_are_refused():
 def test_unknown_names_are_refused():
     with pytest.raises(ValueError, match="no environment 'formation'; did you mean 'formation_v0'"):
         make_joint("formation")
-    with pytest.raises(TypeError, match="no argument 'bound'; did you mean 'bounds'"):
+    with pytest.raises(TypeError, match="got an unexpected keyword argument 'bound'; did you mean 'bounds'"):
         joint("khop/Consensus-v0", bound=True)

@@ -249,7 +249,9 @@ def test_a_line_over_one_step_is_refused():
 @pytest.mark.parametrize("module", [consensus_v0, formation_v0, leader_following_v0])
 def test_unknown_settings_are_refused_with_the_nearest(module):
     for make in (module.parallel_env, module.env, module.batched_env):
-        with pytest.raises(TypeError, match="no argument 'controlperiod'; did you mean 'control_period'"):
+        with pytest.raises(
+            TypeError, match="unexpected keyword argument 'controlperiod'; did you mean 'control_period'"
+        ):
             make(controlperiod=0.1)
 
 
@@ -288,9 +290,9 @@ def test_rendering_needs_a_mode_and_an_episode():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"leader": 2}, "no argument 'leader'; did you mean 'leaders'"),
-        ({"render_mod": None}, "no argument 'render_mod'; did you mean 'render_mode'"),
-        ({"scenari": "paper"}, "no argument 'scenari'; did you mean 'scenario'"),
+        ({"leader": 2}, "got an unexpected keyword argument 'leader'; did you mean 'leaders'"),
+        ({"render_mod": None}, "got an unexpected keyword argument 'render_mod'; did you mean 'render_mode'"),
+        ({"scenari": "paper"}, "got an unexpected keyword argument 'scenari'; did you mean 'scenario'"),
     ],
 )
 def test_the_environment_s_own_arguments_are_among_the_nearest(arguments, said):

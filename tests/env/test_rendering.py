@@ -1,17 +1,13 @@
 """Frames show what they say: agents at their places, ghosts in boxes as wide as the bound, and no trace of the past."""
 
 import copy
-import os
 import pickle
-import subprocess
 import sys
-from pathlib import Path
 
 import networkx as nx
 import numpy as np
 import pytest
 
-import khop_env
 from khop_env.env.rendering import Renderer, canvas
 from khop_env.env.rendering.scene import (
     ALARM_COLOR,
@@ -245,54 +241,20 @@ class TestAsAnObject:
     def test_without_pygame_it_says_what_to_install(self, monkeypatch):
         canvas.load_pygame.cache_clear()
         monkeypatch.setitem(sys.modules, "pygame", None)
-        with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
-            renderer()
-
-
-class TestWindow:
-    @pytest.fixture(autouse=True)
-    def no_screen(self, monkeypatch):
-        monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-    def test_shows_the_frame(self):
-        pygame = canvas.load_pygame()
         drawn = renderer()
-        drawn.show(*scene())
-        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-        assert np.array_equal(shown, renderer().frame(*scene()))
-        assert pickle.loads(pickle.dumps(drawn))._window is None  # one can't be copied
-        drawn.close()
-        drawn.close()
-        assert not pygame.display.get_init()
-        drawn.show(*scene())  # opens again
-        drawn.close()
+        for draw in (drawn.frame, drawn.show):
+            with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
+                draw(*scene())
 
-    def test_closed_by_hand_it_stays_closed(self):
-        pygame = canvas.load_pygame()
-        drawn = renderer()
-        drawn.show(*scene())
-        pygame.event.post(pygame.event.Event(pygame.QUIT))
-        drawn.show(*scene(0.1))
-        assert not pygame.display.get_init()
-        drawn.show(*scene(0.2))
-        assert not pygame.display.get_init()
-        assert drawn.frame(*scene(0.3)).shape == (720, 900, 3)
-        drawn.close()
-
-    def test_without_a_display_there_are_neither_errors_nor_warnings(self):
-        script = (
-            "import sys; sys.path.insert(0, 'tests/env'); import test_rendering as here\n"
-            "drawn = here.renderer(); frame = drawn.frame(*here.scene()); assert frame.min() < 100\n"
-            "import pygame; assert not pygame.display.get_init()\n"
-            "drawn.show(*here.scene(0.1)); drawn.show(*here.scene(0.2)); drawn.close()"
-        )
-        hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "PYGAME_HIDE_SUPPORT_PROMPT")
-        root = Path(khop_env.__file__).parents[1]
-        environment = {name: value for name, value in os.environ.items() if name not in hidden}
-        environment["PYTHONPATH"] = str(root)
-        done = subprocess.run(
-            [sys.executable, "-W", "error", "-c", script], cwd=root, env=environment, capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        assert done.stdout == ""  # pygame's greeting would spoil it
-        assert done.stderr.count("khop_env: there is no display") == 1
+    @pytest.mark.parametrize("again", [False, True])
+    def test_pygame_ended_by_others_is_no_end(self, again):
+        """pygame.quit() makes all fonts invalid for good, also after pygame.init()."""
+        pygame, drawn = canvas.load_pygame(), renderer()
+        drawn.frame(*scene())
+        pygame.quit()
+        if again:
+            pygame.font.init()
+        expected = renderer()
+        expected.frame(*scene())
+        later = scene(0.1, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0))
+        assert np.array_equal(drawn.frame(*later), expected.frame(*later))

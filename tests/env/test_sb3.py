@@ -7,6 +7,8 @@ import pytest
 import torch
 from playing import EVERY, INFO_KEYS, built, same
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from khop_env import make_sb3_vec, make_vec
@@ -28,7 +30,10 @@ def test_rows_are_those_of_the_gymnasium_environment(environment, name):
     """Observations, rewards and ends bit for bit (rewards as float32), in SB3's conventions."""
     radius = {"consensus_v0": 1.9, "formation_v0": 2.3, "leader_following_v0": 2.0}[environment]
     arguments = {"max_cycles": 5, "success_radius": radius * (3.0 if name == "mixed_fleet" else 1.0)}
-    env, other = sb3(environment, name, **arguments), make_vec(environment, COPIES, scenario=built(name), **arguments)
+    env, other = (
+        sb3(environment, name, **arguments),
+        make_vec(environment, COPIES, autoreset_mode="same_step", scenario=built(name), **arguments),
+    )
     env.seed(4)
     assert env.reset().tobytes() == other.reset(seed=4)[0].tobytes()
     for actions in actions_for(env, 12):
@@ -41,7 +46,7 @@ def test_rows_are_those_of_the_gymnasium_environment(environment, name):
             if not dones[row]:
                 assert info == {}
                 continue
-            assert set(info) == {"terminal_observation", "TimeLimit.truncated", *INFO_KEYS}
+            assert set(info) == {"terminal_observation", "TimeLimit.truncated", "episode", *INFO_KEYS}
             assert info["terminal_observation"].tobytes() == infos_2["final_obs"][row].tobytes()
             assert info["TimeLimit.truncated"] is bool(truncated[row])
             for key in INFO_KEYS:
@@ -125,19 +130,6 @@ def test_ppo_learns_and_a_seed_fixes_every_weight():
     assert not same(start, learnt)
 
 
-def test_seed_starts_copies_from_its_own_seeds():
-    """After seed(5) copy b starts from 5 + b, once: the next reset goes on."""
-    env = sb3()
-    other = make_vec("consensus_v0", COPIES, scenario=built("paper"))
-    env.seed(5)
-    first = env.reset()
-    assert first.tobytes() == other.reset(seed=5)[0].tobytes()
-    following = env.reset()
-    assert following.tobytes() == other.reset()[0].tobytes() != first.tobytes()
-    env.seed(5)
-    assert env.reset().tobytes() == first.tobytes()
-
-
 def test_what_was_returned_is_never_written_again():
     """Rows, rewards, dones, infos and terminal observations of different steps share no memory."""
     env = sb3(max_cycles=2)
@@ -165,9 +157,48 @@ def test_sb3_s_own_wrappers_run_on_it():
     assert env.env_is_wrapped(VecMonitor) == [False] * env.num_envs
 
 
-def test_attributes_of_single_rows_are_refused():
-    with pytest.raises(AttributeError, match="rows share one environment; set 'limit' of `batched`, or build another"):
-        sb3().set_attr("limit", 3.0)
+def test_statistics_of_episodes_are_those_of_monitor():
+    """Against Stable-Baselines3's own Monitor around the centralised view, whose reward is the mean of the agents'."""
+    arguments = {"scenario": built("paper"), "max_cycles": 6, "success_radius": 2.3}
+    env = make_sb3_vec("formation_v0", COPIES, **arguments)
+    theirs = make_vec_env("khop/Formation-v0", COPIES, env_kwargs=arguments)
+    for one in (env, theirs):
+        one.seed(11)
+        one.reset()
+    lengths, before = [], 0.0
+    for actions in actions_for(env, 25):
+        *_, dones, infos = env.step(actions)
+        *_, its_dones, its = theirs.step(actions.reshape(COPIES, -1))
+        assert dones.tolist() == np.repeat(its_dones, 8).tolist()
+        for b, info in enumerate(its):
+            found = [row.get("episode") for row in infos[8 * b : 8 * b + 8]]
+            if "episode" not in info:
+                assert found == [None] * 8
+                continue
+            expected = info["episode"]
+            assert {one["l"] for one in found} == {expected["l"]}
+            assert np.mean([one["r"] for one in found]) == pytest.approx(expected["r"], abs=2e-6)
+            assert all(type(one["r"]) is float and type(one["l"]) is int for one in found)
+            assert found[0]["t"] >= before
+            before = found[0]["t"]
+            lengths.append(expected["l"])
+    assert len(set(lengths)) > 1  # some by success, some at the horizon
+    env.reset()
+    for actions in actions_for(env, 6):
+        *_, infos = env.step(actions)
+    assert {info["episode"]["l"] for info in infos if info} == {6}  # reset begins anew
+
+
+def test_ppo_logs_the_mean_return(tmp_path):
+    """Without a wrapper, on the logger that TensorBoard and the progress table read."""
+    model = tiny(sb3(max_cycles=3))
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(2 * 4 * model.n_envs)
+    model.logger.close()
+    lines = (tmp_path / "progress.csv").read_text().splitlines()
+    logged = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
+    assert float(logged[-1]["rollout/ep_len_mean"]) == 3.0
+    assert float(logged[-1]["rollout/ep_rew_mean"]) < 0.0
 
 
 def test_ragged_observations_have_no_rows():
@@ -190,16 +221,13 @@ def test_bad_actions_are_refused_and_change_nothing(bad):
     for actions in actions_for(env, 3):
         with pytest.raises(ValueError, match=message):
             env.step(wrong)
-        assert same(list(env.step(actions)), list(clean.step(actions)))
+        results = env.step(actions), clean.step(actions)
+        for *_, infos in results:
+            for info in infos:
+                info.get("episode", {}).pop("t", None)  # seconds since each was made
+        assert same(*results)
 
 
 def test_unknown_environments_are_refused_with_the_nearest():
     with pytest.raises(ValueError, match="no environment 'consensus'; did you mean 'consensus_v0'"):
         make_sb3_vec("consensus")
-
-
-def test_options_reach_the_copies():
-    vec = make_sb3_vec("consensus_v0", num_envs=2)
-    vec.set_options({"initial_state": {"drifter_3": [0.5, -0.25]}})
-    vec.reset()
-    np.testing.assert_array_equal(vec.batched.simulator.x[:, 6:8], [[0.5, -0.25]] * 2)

@@ -1,11 +1,12 @@
-"""Trails in frames are those of the running episode, all of it, however seldom a frame is asked for."""
+"""Frames of environments: trails are those of the running episode, all of it; and no step fails by drawing."""
 
+import contextlib
 import copy
 import sys
 
 import numpy as np
 import pytest
-from playing import built, parallel, play
+from playing import built, parallel, play, same
 
 from khop_env.env import KHopEnv
 from khop_env.env.rendering import canvas
@@ -89,8 +90,40 @@ def test_a_copy_goes_on_with_the_same_frames():
     assert np.array_equal(env.render(), twin.render())
 
 
-def test_a_render_mode_without_pygame_is_refused_at_once(monkeypatch):
+@pytest.mark.parametrize("mode", ["rgb_array", "human"])
+def test_without_pygame_only_rendering_fails(monkeypatch, mode):
+    """Libraries ask for a render mode that nobody needs (Stable-Baselines3's make_vec_env); steps are those without."""
     canvas.load_pygame.cache_clear()
     monkeypatch.setitem(sys.modules, "pygame", None)
+    env, plain = parallel("consensus_v0", render_mode=mode), parallel("consensus_v0")
+    missing = pytest.warns(RuntimeWarning, match=r"the window isn't drawn: rendering needs pygame-ce: pip install")
+    with missing if mode == "human" else contextlib.nullcontext():
+        assert same(env.reset(seed=0), plain.reset(seed=0))
+        assert same(play(env, 2), play(plain, 2))
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
-        team()
+        env.render()
+    env.close()
+
+
+def test_a_failed_drawing_fails_no_step(monkeypatch):
+    """The results of the step arrive, the environment goes on, and so does its window when drawing works again."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env, plain = parallel("consensus_v0", render_mode="human"), parallel("consensus_v0")
+    assert same(env.reset(seed=0), plain.reset(seed=0))
+    window = env._renderer._window
+    with monkeypatch.context() as broken:
+        broken.setattr(window, "show", lambda picture: window.nothing)
+        with pytest.warns(RuntimeWarning, match="the window isn't drawn: 'Window' object has no attribute 'nothing'"):
+            assert same(play(env, 2), play(plain, 2))
+        with pytest.raises(AttributeError, match="nothing"):
+            env.render()
+    assert same(play(env, 2), play(plain, 2))
+    env.close()
+
+
+@pytest.mark.parametrize(("period", "rate"), [(0.05, 20.0), (0.3, 1.0 / 0.3), (2.0, 0.5), (10.0, 0.1)])
+def test_the_frame_rate_is_that_of_actions(period, rate):
+    """Positive for slow control, too, and not rounded; the same in the centralised view."""
+    env = parallel("consensus_v0", control_period=period, render_mode="rgb_array")
+    assert env.metadata["render_fps"] == rate
+    assert make_joint("consensus_v0", scenario=built("paper"), control_period=period).metadata["render_fps"] == rate

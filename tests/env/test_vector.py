@@ -16,8 +16,8 @@ COPIES, CYCLES = 3, 17
 every = pytest.mark.parametrize(("environment", "name"), EVERY)
 
 
-def vector(environment="consensus_v0", name="paper", copies=COPIES, **arguments):
-    return make_vec(environment, copies, scenario=built(name), **arguments)
+def vector(environment="consensus_v0", name="paper", copies=COPIES, autoreset_mode="same_step", **arguments):
+    return make_vec(environment, copies, autoreset_mode=autoreset_mode, scenario=built(name), **arguments)
 
 
 def actions_for(env, cycles, scale=1.3):
@@ -225,6 +225,7 @@ def test_bad_resets_are_refused_and_change_nothing():
         ({"seed": -1}, "a seed must be a non-negative integer, or None; got -1"),
         ({"options": {"initial_state": np.zeros((2, n))}}, rf"x0 must be finite, of shape \({n},\) or \(3, {n}\)"),
         ({"options": {"initial_state": np.full(n, np.inf)}}, "must be finite"),
+        ({"options": [1]}, r"options are a dictionary, as {'initial_state': ...}; got \[1\] \(list\)"),
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(**arguments)
@@ -256,8 +257,9 @@ def test_ragged_observations_have_no_rows():
         vector(uniform=False)
 
 
-def test_a_step_before_the_first_reset_is_refused():
-    env = vector()
+@pytest.mark.parametrize("mode", ["same_step", "next_step", "disabled"])
+def test_a_step_before_the_first_reset_is_refused(mode):
+    env = vector(autoreset_mode=mode)
     with pytest.raises(ValueError, match=r"no episode is running in 3 of 3 copies, the first 0: call reset\(\) first"):
         env.step(np.zeros(env.action_space.shape))
 
@@ -268,7 +270,8 @@ def test_a_step_before_the_first_reset_is_refused():
         ({"environment": "consensus_v1"}, ValueError, "no environment 'consensus_v1'; did you mean 'consensus_v0'"),
         ({"environment": "leader_folowing_v0"}, ValueError, "did you mean 'leader_following_v0'"),
         ({"scenario": "papr"}, ValueError, "no scenario 'papr'; did you mean 'paper'"),
-        ({"max_cycle": 3}, TypeError, "no argument 'max_cycle'; did you mean 'max_cycles'"),
+        ({"max_cycle": 3}, TypeError, "got an unexpected keyword argument 'max_cycle'; did you mean 'max_cycles'"),
+        ({"autoreset_mode": "nextstep"}, ValueError, "must be 'same_step', 'next_step', 'disabled' .* got 'nextstep'"),
         ({"num_envs": 0}, ValueError, "num_envs must be a positive integer; got 0"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Pictures of a running fleet, as arrays or in a window; needs pygame-ce, which is imported when one is made."""
+"""Pictures of a running fleet, as arrays or in a window; needs pygame-ce, which is imported when one is drawn."""
 
 from khop_env.env.rendering.renderer import Renderer
 

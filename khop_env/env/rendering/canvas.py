@@ -6,6 +6,7 @@ import functools
 import math
 import os
 import sys
+import weakref
 from types import ModuleType
 from typing import Any
 
@@ -55,6 +56,11 @@ class Canvas:
 
     def clear(self) -> None:
         """Start a picture."""
+        try:
+            self._font(12).get_height()
+        except self._pg.error:  # others have called pygame.quit(), which makes every open font invalid for good
+            self._pg.font.init()
+            self._font.cache_clear()
         self._large.fill("white")
         self._texts.clear()
 
@@ -149,34 +155,72 @@ class Canvas:
 
 
 class Window:
-    """A window on the screen; without a screen SDL draws to none, and a message says so.
+    """A window on the screen, one of several; without a screen SDL draws to none, and a message says so.
 
     Args:
         size: in pixels.
         title: of the window.
+
+    Raises:
+        ImportError: for pygame in place of pygame-ce; it has one window only.
     """
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
         pg = self._pg = load_pygame()
+        if not hasattr(pg, "Window"):
+            raise ImportError(
+                f"windows need pygame-ce, and pygame {pg.version.ver} stands in its place: pip uninstall pygame, and "
+                "then pip install --force-reinstall pygame-ce"
+            )
+        self._size, self._title, self._dismissed = size, title or "khop_env", False
+        self._clock = pg.time.Clock()
+        self._open()
+        _windows.add(self)
+
+    def show(self, canvas: Canvas) -> bool:
+        """Show a picture, wait for its turn, and return whether the user wants the window to go."""
+        try:
+            surface = self._window.get_surface()
+        except self._pg.error:  # others have called pygame.quit() or pygame.display.quit(), which close every window
+            self._open()
+            surface = self._window.get_surface()
+        surface.blit(canvas.surface, (0, 0))
+        self._window.flip()
+        self._clock.tick(FRAMES_PER_SECOND)
+        self._read_events()
+        return self._dismissed
+
+    def close(self) -> None:
+        """Take it off the screen, and nobody else's."""
+        self._window.destroy()
+        _windows.discard(self)
+
+    def _open(self) -> None:
+        pg = self._pg
         if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
             os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         pg.display.init()
         if pg.display.get_driver() in ("dummy", "offscreen"):
             _say_once('khop_env: there is no display to show frames on; render_mode="rgb_array" gives them as arrays')
-        self._surface = pg.display.set_mode(size)
-        pg.display.set_caption(title or "khop_env")
-        self._clock = pg.time.Clock()
+        self._window = pg.Window(self._title, self._size)
 
-    def show(self, canvas: Canvas) -> bool:
-        """Show a picture, wait for its turn, and return whether the user wants the window to go."""
-        self._surface.blit(canvas.surface, (0, 0))
-        self._pg.display.flip()
-        self._clock.tick(FRAMES_PER_SECOND)
-        return any(event.type == self._pg.QUIT for event in self._pg.event.get())
+    def _read_events(self) -> None:
+        """Tell all of our windows what the user wants; there is one queue, and events of others' windows stay in it."""
+        pg = self._pg
+        ours_alone = pg.display.get_surface() is None  # then nobody else empties the queue
+        for event in pg.event.get(None if ours_alone else (pg.QUIT, pg.WINDOWCLOSE)):
+            if event.type == pg.QUIT:
+                for window in _windows:
+                    window._dismissed = True
+            elif event.type == pg.WINDOWCLOSE:
+                closed = [window for window in _windows if window._window is event.window]
+                for window in closed:
+                    window._dismissed = True
+                if not closed:
+                    pg.event.post(event)
 
-    def close(self) -> None:
-        """Take it off the screen."""
-        self._pg.display.quit()
+
+_windows: weakref.WeakSet[Window] = weakref.WeakSet()
 
 
 @functools.cache

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.env.rendering.camera import Camera, Labels
-from khop_env.env.rendering.canvas import Canvas, Window, load_pygame
+from khop_env.env.rendering.canvas import Canvas, Window
 from khop_env.env.rendering.panel import CIRCLE, Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import (
     EDGE_COLOR,
@@ -59,7 +59,6 @@ class Renderer:
         observer: index of the agent whose beliefs are shown.
 
     Raises:
-        ModuleNotFoundError: without pygame-ce.
         ValueError: for an observer or a driven agent that isn't an agent.
     """
 
@@ -75,7 +74,6 @@ class Renderer:
         error_label: str = "task error",
         size: tuple[int, int] = (900, 720),
     ) -> None:
-        load_pygame()
         fleet, agents = design.fleet, len(design.fleet)
         self._fleet, self._title, self._size = fleet, title, size
         self._driven = frozenset(fleet.agent(agent) for agent in driven)
@@ -168,6 +166,9 @@ class Renderer:
 
         Returns:
             (H, W, 3) pixels, a fresh array.
+
+        Raises:
+            ModuleNotFoundError: without pygame-ce.
         """
         return self._draw(t, x, estimates, normalized, task_error, decorate).array()
 
@@ -191,6 +192,9 @@ class Renderer:
             normalized: largest |e| = |xi| / rho of now.
             task_error: in m, if there is one to show.
             decorate: draws what a task adds, below the agents.
+
+        Raises:
+            ModuleNotFoundError: without pygame-ce.
         """
         if self._dismissed:
             return
