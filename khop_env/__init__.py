@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import pettingzoo
 
-from khop_env.environments import ENVIRONMENTS, gymnasium_id
+from khop_env.catalog import ENVIRONMENTS, gymnasium_id
 
 if TYPE_CHECKING:
     from khop_env.registry import environments, make, make_sb3_vec, make_vec, scenario

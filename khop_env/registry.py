@@ -12,8 +12,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 import khop_env.tasks
+from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
-from khop_env.environments import ENVIRONMENTS
 from khop_env.observers import Proximal
 from khop_env.physics import did_you_mean
 from khop_env.scenarios.convoy import convoy
@@ -93,7 +93,7 @@ def make_batched(
     of_task = list(_task_parameters(task)) if isinstance(task, type) else []
     for name in arguments:
         if name not in (*of_settings, *of_task):
-            known = [*of_task, *of_settings, "scenario", "num_envs", "render_mode"]
+            known = ["scenario", *of_task, *of_settings, "num_envs", "render_mode"]
             raise TypeError(f"got an unexpected keyword argument {name!r}; {did_you_mean(name, known)}")
     settings = Settings(**{name: value for name, value in arguments.items() if name in of_settings})
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:

@@ -193,7 +193,7 @@ class KHopSB3VecEnv(VecEnv):
         if set(rows) != set(range(self.num_envs)):
             raise AttributeError(
                 f"rows share one environment: {what} for all {self.num_envs} of them, not for {len(set(rows))}; "
-                "`batched` is the environment, and batched.reset(copies=...) resets some copies"
+                "`batched` is the environment, and batched.reset(env_ids=...) resets some copies"
             )
 
     def _initial_states(self) -> FloatArray | None:

@@ -98,7 +98,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
         states = initial_states(batched.fleet, options)
         if states is not None and states.shape == (batched.num_envs, batched.fleet.n):
             states = states[which]
-        observations, infos = batched.reset(seed, copies=which, initial_states=states)
+        observations, infos = batched.reset(seed, env_ids=which, initial_states=states)
         return self._rows(observations), self._described(infos, np.repeat(chosen, len(batched.agents)))
 
     def step(self, actions: ArrayLike) -> VectorStep:  # type: ignore[override]  # Gymnasium's own flags are bool, too

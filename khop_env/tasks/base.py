@@ -96,15 +96,15 @@ class MapCanvas(Protocol):
     """Draws on the map of a frame, in metres; colours are "#RRGGBB"."""
 
     def circle(self, center: FloatArray, radius: float, color: str, *, filled: bool = False) -> None:
-        """A circle about `center` (2,)."""
+        """A circle about `center` (2,) with `radius` in m and a `color`; its inside, too, if `filled`."""
         ...
 
     def line(self, points: FloatArray, color: str, width: float = 2.0) -> None:
-        """A line through `points` (K, 2), `width` pixels wide."""
+        """A line through `points` (K, 2) in m of a `color`, `width` pixels wide."""
         ...
 
     def cross(self, center: FloatArray, color: str) -> None:
-        """A cross at `center` (2,), of the size of an agent's marker."""
+        """A cross at `center` (2,) of a `color`, as large as an agent's marker."""
         ...
 
 

@@ -23,15 +23,16 @@ def made(actuator, name="mixed_fleet", **arguments):
 def watched(env):
     """The inputs that the simulator is stepped with, as fractions of the limits, one (m,) per substep."""
     simulator, seen = env.batched.simulator, []
-    step = simulator.step
+    advance = simulator.advance
 
-    def spied(dt, u):
+    def spied(dt):
         assert dt == pytest.approx(PERIOD / SUBSTEPS)
-        seen.append(u[0] / env.batched.fleet.input_limit)
-        step(dt, u)
-        np.testing.assert_array_equal(simulator.u, u)
+        held = simulator.u.copy()
+        seen.append(held[0] / env.batched.fleet.input_limit)
+        advance(dt)
+        np.testing.assert_array_equal(simulator.u, held)
 
-    simulator.step = spied
+    simulator.advance = spied
     return seen
 
 

@@ -15,10 +15,9 @@ from gymnasium.wrappers.vector import (
     RecordEpisodeStatistics,
     RescaleObservation,
 )
-from playing import built, same
+from playing import INFO_KEYS, built, same
 
 from khop_env import make_vec
-from khop_env.env import INFO_KEYS
 from khop_env.env.vector import _WRAPPERS_MISCOUNT
 
 COPIES = 3

@@ -154,7 +154,7 @@ class TestFrame:
     @pytest.mark.parametrize("dim", [1, 3])
     def test_fleets_on_a_line_and_in_space(self, dim):
         fleet = design((SingleIntegrator(dim=dim),) * 3)
-        drawn = Renderer(fleet, TASK, leaders=[1])
+        drawn = Renderer(fleet, TASK, driven=[1])
         x = np.zeros(3 * dim)
         x[dim] = 1.0
         frame = drawn.frame(2.0, x, x[fleet.states.layout.column_source], 0.1)
@@ -200,7 +200,7 @@ class TestWhoIsShown:
         with pytest.raises(ValueError, match="no agent 7"):
             renderer(observer=7)
         with pytest.raises(ValueError, match="no agent 9"):
-            renderer(leaders=[9])
+            renderer(driven=[9])
 
     def test_types_look_different_each(self):
         class Strange(DriftingIntegrator):

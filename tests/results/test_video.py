@@ -81,7 +81,7 @@ def test_the_gauge_shows_both_kinds_of_observers_at_that_time(run, tmp_path, mon
     monkeypatch.setattr(rendering.Renderer, "frame", lambda self, *scene: (shown.append(scene), draw(self, *scene))[1])
     write_video(recording, scenario, tmp_path / "film.mp4")
     assert len(shown) == 10
-    for (t, *_, ratio, _), k in zip(shown, video._samples(recording, 25.0), strict=True):
+    for (t, _, _, ratio, *_), k in zip(shown, video._samples(recording, 25.0), strict=True):
         kinds = recording.states, recording.inputs
         assert t == recording.time[k]
         assert ratio == max((np.abs(kind.disagreement[k]) / kind.rho[k]).max() for kind in kinds)
