@@ -9,6 +9,7 @@ Two experiments on a scenario's closed loop, whose goal set A is agreement of th
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -64,6 +65,7 @@ class Misinformed:
         self._directions = rng.normal(size=shape)
         self._frequency = rng.uniform(0.2, 5.0, batch)  # rad/s
         self._pattern = np.arange(batch) % len(PATTERNS)
+        self._seen: View | None = None
 
     def errors(self, t: FloatArray, view: View) -> FloatArray:
         """(B, unheard edges, d) errors in m."""
@@ -78,8 +80,11 @@ class Misinformed:
 
     def __call__(self, t: FloatArray, view: View) -> FloatArray:
         """The law's inputs on the truth plus errors."""
-        view.displacement[:, self._unheard] += self.errors(t, view)
-        return self._law(t, view)
+        if self._seen is None:
+            self._seen = dataclasses.replace(view)  # one object for all calls, as laws expect it
+        self._seen.x, self._seen.displacement = view.x, view.displacement.copy()
+        self._seen.displacement[:, self._unheard] += self.errors(t, view)
+        return self._law(t, self._seen)
 
 
 def injected_errors(

@@ -41,9 +41,11 @@ class KeepApart(Task):
         to_goal = np.linalg.norm(self.memory["goal"] - positions, axis=1).T  # (B, N)
         gaps = np.linalg.norm(positions[:, None] - positions, axis=2)  # (N, N, B)
         gaps[np.diag_indices(len(gaps))] = np.inf
-        close = gaps.min(axis=1).T < self.radius
+        close = self.radius > gaps.min(axis=1).T
         reward = -world.control_period * (to_goal + self.penalty * close)
-        return Outcome(reward, np.zeros(world.num_envs, bool), {"task_error": to_goal, "too_close": close.astype(float)})
+        return Outcome(
+            reward, np.zeros(world.num_envs, bool), {"task_error": to_goal, "too_close": close.astype(float)}
+        )
 
     def draw(self, canvas, world):
         """Show the goals in frames and films."""

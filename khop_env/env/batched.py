@@ -229,7 +229,7 @@ class BatchedEnv:
 
     @functools.cached_property
     def _signature(self) -> dict[str, tuple[str, ...]]:
-        return signature(self.task, self.world, self.settings)
+        return signature(self.task, self.world, self.settings, self.simulator.disturbance)
 
     def _generator(self, b: int, seed: int | None) -> np.random.Generator:
         own = self._generators[b]

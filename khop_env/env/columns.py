@@ -182,7 +182,9 @@ class ObservationColumns:
         high = np.max([[one.field.high for one in mine] for mine in columns], axis=0)
         return [
             [
-                Column(Field(one.field.name, one.field.unit, a, b), one.kind, one.row, one.origin, one.value)
+                Column(
+                    Field(one.field.name, one.field.unit, a, b), one.kind, one.row, one.origin, one.value, one.bounds
+                )
                 for one, a, b in zip(mine, low.tolist(), high.tolist(), strict=True)
             ]
             for mine in columns

@@ -28,6 +28,7 @@ class Column:
         row: of the states, estimates, bounds, inputs or task values that it reads.
         origin: the row of the states that a relative position is taken from, or -1.
         value: of a constant.
+        clip: smallest and largest value, if narrower than the field's: where agents of several types share one space.
     """
 
     field: Field
@@ -35,6 +36,12 @@ class Column:
     row: int = -1
     origin: int = -1
     value: float = 0.0
+    clip: tuple[float, float] | None = None
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Smallest and largest value."""
+        return self.clip or (self.field.low, self.field.high)
 
 
 class Sources(NamedTuple):
@@ -85,18 +92,15 @@ class Readout:
         live = [q for q, column in enumerate(columns) if column.kind != CONSTANT]
         kinds, rows = [columns[q].kind for q in live], [columns[q].row for q in live]
         # float32 bounds, so that what is clipped to them in float64 is inside them as float32, too
-        low, high = (
-            np.array([getattr(columns[q].field, end) for q in live], np.float32).astype(float)
-            for end in ("low", "high")
-        )
+        bounds = np.array([columns[q].bounds for q in live], np.float32).reshape(-1, 2).astype(float)
         self._live = _LiveColumns(
             np.array(live, np.int64),
             np.array(kinds, np.int64),
             np.array(rows, np.int64),
             np.array([columns[q].origin for q in live], np.int64),
             np.array([owner[q] for q in live], np.int64),
-            low,
-            high,
+            np.ascontiguousarray(bounds[:, 0]),
+            np.ascontiguousarray(bounds[:, 1]),
         )
         self.uses_bounds = BOUND in kinds
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)

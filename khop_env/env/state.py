@@ -13,6 +13,7 @@ from khop_env.env.actuators import described
 from khop_env.env.layout import Float32Array
 from khop_env.env.settings import Settings
 from khop_env.observers import FloatArray, IntArray
+from khop_env.physics import Disturbance
 from khop_env.simulation import SimulatorState
 from khop_env.tasks import Task, World
 
@@ -69,9 +70,21 @@ class EnvState:
                 )
 
 
-def signature(task: Task, world: World, settings: Settings) -> dict[str, tuple[str, ...]]:
+def signature(
+    task: Task, world: World, settings: Settings, disturbance: Disturbance | None
+) -> dict[str, tuple[str, ...]]:
     """What two environments must have in common for one to continue from the other's state, in words."""
-    return {**task.signature(world), "actuators": (described(settings.actuator),)}  # type: ignore[arg-type]
+    design = world.design
+    steps = f"{settings.control_period:g} s in {settings.substeps} steps of order {settings.order}"
+    bounds = dict.fromkeys(repr(bound) for bound in (*design.states.bounds, *design.inputs.bounds))
+    return {
+        **task.signature(world),
+        "actuators": (described(settings.actuator),),  # type: ignore[arg-type]
+        "control periods": (steps,),
+        "disturbances": (repr(disturbance),),
+        "bounds": tuple(bounds),
+        "numbers of hops": (f"k = {design.k}",),
+    }
 
 
 def _only(first: tuple[str, ...], second: tuple[str, ...]) -> str:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.layout import FloatArray
-from khop_env.physics import AgentModel
+from khop_env.physics import AgentModel, read_only
 
 
 class _DriftRun(NamedTuple):
@@ -38,7 +38,7 @@ class Prediction:
             out.fill(0.0)
         times = t[:, None]
         for model, columns, pairs in self._drifts:
-            rates = model.drift(times, estimate[columns].T.reshape(self._num_envs, pairs, model.n))
+            rates = model.drift(times, read_only(estimate[columns].T.reshape(self._num_envs, pairs, model.n)))
             out[columns] = rates.reshape(self._num_envs, -1).T
         for state_columns, input_columns in self._inputs:
             out[state_columns] += input_estimate[input_columns]

@@ -4,7 +4,7 @@ Agent models f_i and g_i, disturbances w_i, the fleet that joins them into flat 
 say who hears whom. Everything here is a pure function of (t, x, u); randomness is drawn once per episode.
 """
 
-from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean
+from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean, read_only
 from khop_env.physics.disturbance import AttachedDisturbance, Channels, Disturbance, Sum, Term
 from khop_env.physics.disturbances import DISTURBANCES, BandLimitedNoise, Coupling, Gust, Sinusoid
 from khop_env.physics.fleet import Fleet, Group
@@ -59,6 +59,7 @@ __all__ = [
     "k_hop_neighbors",
     "paper_tree",
     "random_geometric_graph",
+    "read_only",
     "validate_graph",
     "velocity_to_input",
 ]

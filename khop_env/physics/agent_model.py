@@ -32,6 +32,13 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f"known: {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}"
 
 
+def read_only(array: FloatArray) -> FloatArray:
+    """A view that can't be written through."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 _PROBES = 8  # random inputs at which it is seen whether g is affine in each input
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from khop_env.elementary import weighted_sum
 from khop_env.observers import FloatArray, PlantState, SolveError
-from khop_env.physics import Fleet
+from khop_env.physics import Fleet, read_only
 from khop_env.simulation.view import Law, ViewBuilder
 
 
@@ -38,7 +38,7 @@ class FleetPlant:
 
     def rate(self, state: PlantState, out: FloatArray) -> None:
         """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
-        states = state.x.T
+        states = read_only(state.x.T)
         self.fleet.drift(state.t, states, out.T)
         out += state.g
         if self.disturbance is not None:
@@ -72,7 +72,7 @@ class FleetPlant:
                     f"{(self.num_envs, self.fleet.m)}"
                 )
             state.u.T[:] = u
-        self.fleet.input_map(state.t, state.x.T, state.u.T, state.g.T)
+        self.fleet.input_map(state.t, read_only(state.x.T), read_only(state.u.T), state.g.T)
 
 
 def require_finite(x: FloatArray, fleet: Fleet) -> None:

@@ -25,6 +25,7 @@ from khop_env.observers import (
     SolveError,
 )
 from khop_env.observers.disagreement import disagreement
+from khop_env.physics import read_only
 from khop_env.simulation.plant import FleetPlant
 from khop_env.simulation.state import LinkState, SimulatorState
 from khop_env.simulation.view import Law, Observe, ViewBuilder
@@ -116,32 +117,32 @@ class Simulator:
     @property
     def t(self) -> FloatArray:
         """(B,) time since reset in s."""
-        return self.state.t
+        return read_only(self.state.t)
 
     @property
     def x(self) -> FloatArray:
         """(B, n) true states; `fleet.state_slice(i)` is agent i's part."""
-        return self.state.x.T
+        return read_only(self.state.x.T)
 
     @property
     def u(self) -> FloatArray:
         """(B, m) inputs in force."""
-        return self.state.u.T
+        return read_only(self.state.u.T)
 
     @property
     def g(self) -> FloatArray:
         """(B, n) their effect g_i(x_i, u_i) on the states."""
-        return self.state.g.T
+        return read_only(self.state.g.T)
 
     @property
     def estimates(self) -> FloatArray:
         """(B, P) state estimates in the order of `design.states.layout`."""
-        return self.state.memory["estimate"].T
+        return read_only(self.state.memory["estimate"].T)
 
     @property
     def input_estimates(self) -> FloatArray:
         """(B, Q) estimates of g in the order of `design.inputs.layout`."""
-        return self.state.memory["input_estimate"].T
+        return read_only(self.state.memory["input_estimate"].T)
 
     @property
     def extremes(self) -> Extremes:

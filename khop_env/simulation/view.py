@@ -10,7 +10,7 @@ import numpy as np
 
 from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
-from khop_env.physics import Fleet
+from khop_env.physics import Fleet, read_only
 
 Observe = Literal["estimate", "oracle", "local"]
 OBSERVE: tuple[Observe, ...] = ("estimate", "oracle", "local")
@@ -29,7 +29,7 @@ class View:
         displacement: (B, E, d) position of j, as i hears or estimates it, minus i's own and minus what the task wants
             it to be, in m; 0 where not known.
 
-    The arrays are overwritten by the next evaluation; a law that keeps one copies it.
+    The arrays are read-only, and overwritten by the next evaluation; a law that keeps one copies it.
     """
 
     fleet: Fleet
@@ -100,8 +100,9 @@ class ViewBuilder:
     def update(self, x: FloatArray, estimate: FloatArray) -> View:
         """The view at states `x` (n, B) and estimates (P, B)."""
         displacements(self._kind, self._own, self._other, x, estimate, self._columns)
-        self.view.x = x.T
-        self.view.displacement = self._columns.transpose(2, 0, 1)  # anew: a copy of this object would lose the tie
+        # both anew: in a copy of this object they would be views of other arrays
+        self.view.x = read_only(x.T)
+        self.view.displacement = read_only(self._columns.transpose(2, 0, 1))
         return self.view
 
 
