@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from agents.learning.config import TrainingConfig
-from agents.learning.learned import Layers, LearnedPolicy
+from agents.learning.learned import LearnedPolicy
+from agents.learning.policy_file import Layers
 from agents.learning.scaling import ObservationScaler
 
 
