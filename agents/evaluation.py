@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +14,10 @@ from agents.policies import make_policy
 from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
+from khop_env.registry import environment_module
+from khop_env.registry import scenario as load_scenario
 from khop_env.results.recording import Progress
+from khop_env.scenarios import Scenario
 
 if TYPE_CHECKING:
     import polars as pl
@@ -72,6 +77,17 @@ class Episodes:
         rest = [one.name for one in fields(self) if one.name not in ("task_error", "time", "returns", "seed")]
         numbers = {"seed": self.seed, "return": self.returns, **{name: getattr(self, name) for name in rest}}
         return pl.DataFrame({**where, **numbers})
+
+
+def chosen_scenario(environment: str, scenario: Scenario | str | Path | None) -> Scenario:
+    """A scenario that may be given by name or path, or left out for the environment's own.
+
+    Raises:
+        ValueError: for an unknown environment or scenario, naming the nearest.
+    """
+    default = inspect.signature(environment_module(environment).batched_env).parameters["scenario"].default
+    chosen = default if scenario is None else scenario
+    return chosen if isinstance(chosen, Scenario) else load_scenario(chosen)
 
 
 def evaluate(

@@ -298,7 +298,8 @@ def _verdict(ours: FloatArray, theirs: FloatArray) -> str:
 
 
 def _train(job: tuple[Path, StudyTask, str, int]) -> str:
-    from agents.learning.training import CHECKPOINT, train
+    from agents.learning.run_folder import CHECKPOINT
+    from agents.learning.training import train
 
     root, task, variant, seed = job
     folder = folder_of(root, task, variant, seed)

@@ -88,7 +88,7 @@ def test_the_saved_policy_acts_like_the_model(changes, tmp_path):
     config = dataclasses.replace(SMALL, timesteps=2_000, num_envs=4, evaluations=1, **changes)
     from agents.learning.training import _Run
 
-    run = _Run(config, None, False, None)
+    run = _Run(config, None, None, None)
     policy = run.learn().policy
     last = run._exported()
     last.save(tmp_path / "policy.npz")
