@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -100,8 +101,9 @@ def evaluate(
     """Play every policy over the same episodes.
 
     Args:
-        env: an environment of khop_env; a batch of B plays B episodes at once. It is reset, and left at an end.
-        policies: by name, or names that `make_policy` knows.
+        env: an environment of khop_env of any kind, wrapped or not; a batch of B plays B episodes at once. Wrappers
+            have no part: policies get the environment's own observations. It is reset, and left at an end.
+        policies: by name, or a list of names that `make_policy` knows.
         seeds: one per episode; episodes of different policies with the same seed have the same initial states,
             disturbances and leaders, so that differences can be paired.
         progress: told how far it is.
@@ -111,11 +113,14 @@ def evaluate(
         the columns of `Episodes`.
 
     Raises:
+        TypeError: for an environment or a policy that isn't one.
         ValueError: for an unknown policy, no seed, or actions that the environment refuses.
     """
     import polars as pl
 
     batched = batched_of(env)
+    if isinstance(policies, str) or not isinstance(policies, Mapping | Sequence):
+        raise TypeError(f"policies are a list of names or a mapping, e.g. {{'mine': policy}}; got {policies!r}")
     chosen = policies if isinstance(policies, Mapping) else {spec: make_policy(spec) for spec in policies}
     description = describe(batched)
     frames = []
@@ -132,16 +137,18 @@ def play(
     """Play one policy, as many episodes at once as the environment has copies.
 
     Args:
-        env: an environment of khop_env.
+        env: as for `evaluate`.
         policy: who plays.
         seeds: one per episode.
         name: of the policy, for errors.
         progress: told how far it is.
 
     Raises:
+        TypeError: for an environment or a policy that isn't one.
         ValueError: for no seed, or where policy and environment don't fit.
     """
     batched = batched_of(env)
+    _require_policy(policy, name)
     if not len(seeds):
         raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
     parts = []
@@ -168,9 +175,8 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
     error[0] = infos["task_error"].mean(axis=1)
     running, length = np.ones(env.batch, bool), np.full(env.batch, horizon)
     for cycle in range(1, horizon + 1):
-        actions = policy.act(by_agent(env, observations))
-        given = _stacked(env, actions)
-        observations, reward, terminated, truncated, infos = env.step(given)
+        actions = _by_agent(env, policy.act(by_agent(env, observations)))
+        observations, reward, terminated, truncated, infos = env.step(np.concatenate(list(actions.values()), axis=1))
         returns += np.where(running, reward.mean(axis=1), 0.0)
         squared = [
             np.square(np.clip(actions[agent][:, :m], -1.0, 1.0, dtype=np.float64)).sum(axis=1)
@@ -210,18 +216,47 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
     )
 
 
-def _stacked(env: BatchedEnv, actions: Mapping[str, Any]) -> np.ndarray:
-    """Actions by agent as the arrays that the environment takes.
+def _require_policy(policy: object, name: str) -> None:
+    """Refuse what isn't a policy.
 
     Raises:
-        ValueError: for actions that are missing or misshapen.
+        TypeError: saying what one is.
+    """
+    if isinstance(policy, type):
+        raise TypeError(f"policy {name!r} is the class {policy.__name__}: give an object of it")
+    if not all(callable(getattr(policy, one, None)) for one in ("reset", "act")):
+        how = "a policy has reset(env, seeds) and act(observations); agents.make_policy makes one of a name"
+        if callable(getattr(policy, "predict", None)):
+            how = "agents.sb3_policy makes a policy of a Stable-Baselines3 model"
+        raise TypeError(f"policy {name!r} is of type {type(policy).__name__}: {how}")
+
+
+def _by_agent(env: BatchedEnv, actions: object) -> dict[str, np.ndarray]:
+    """A policy's actions (B, m_i) as arrays.
+
+    Raises:
+        ValueError: for actions that are missing or misshapen, or aren't numbers by agent.
     """
     sizes = (env.action_offset[1:] - env.action_offset[:-1]).tolist()
+    if not isinstance(actions, Mapping):
+        what = f"an array of shape {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
+        raise ValueError(
+            f"act(observations) has to return actions by agent, {{{env.agents[0]!r}: array of shape "
+            f"{(env.batch, sizes[0])}, ...}}; got {what}"
+        )
+    found = {}
     for agent, size in zip(env.agents, sizes, strict=True):
         if agent not in actions:
             raise ValueError(f"no action for {agent!r}; got some for {', '.join(list(actions)[:8]) or 'nobody'}")
-        if np.shape(actions[agent]) != (env.batch, size):
+        try:
+            found[agent] = np.asarray(actions[agent])
+        except ValueError:  # lists of different lengths
+            found[agent] = np.asarray(None)
+        if found[agent].dtype.kind not in "fiu":
+            raise ValueError(f"actions of {agent!r} aren't numbers: {reprlib.repr(actions[agent])}")
+        if found[agent].shape != (env.batch, size):
             raise ValueError(
-                f"actions of {agent!r} must have shape {(env.batch, size)}; got {np.shape(actions[agent])}"
+                f"actions of {agent!r} must have shape {(env.batch, size)}, one row for each copy of the environment; "
+                f"got {found[agent].shape}"
             )
-    return np.concatenate([actions[agent] for agent in env.agents], axis=1)
+    return found
