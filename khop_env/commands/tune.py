@@ -33,6 +33,7 @@ def tune(
     from agents.laws import LAWS
     from agents.tuning import SEEDS, tune
     from agents.workers import Interrupted
+    from khop_env.env import Settings
     from khop_env.physics import did_you_mean
     from khop_env.registry import environment_module, environments
 
@@ -49,6 +50,7 @@ def tune(
         modules = {one: environment_module(one) for one in (environments() if everything else [str(environment)])}
         call = "--all" if everything else " ".join(filter(None, [environment, scenario and f"--scenario {scenario}"]))
         typer.echo(f"# Found by khop tune {call}, on {len(SEEDS)} episodes with seeds from {SEEDS[0]}.")
+        typer.echo(f"control_period = {Settings.control_period:g}  # s")
         for one, module in modules.items():
             default = inspect.signature(module.batched_env).parameters["scenario"].default
             for where in SHIPPED if everything else [scenario or default]:
