@@ -119,6 +119,8 @@ def _print_tables(
         ],
         "(a) The law on the truth plus errors, no disturbance: ultimate distance to the goal set",
     )
+    if not swept:  # it was interrupted before
+        return
     typer.echo()
     keys = ("delta", "error", "floor", "distance", "excess", "bound")
     print_table(
