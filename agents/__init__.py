@@ -11,6 +11,7 @@ from agents.policies import POLICIES, make_policy
 from agents.policy import EnvDescription, Policy, describe
 from agents.scripted import LawPolicy, RandomPolicy, ZeroPolicy
 from agents.set_iss import analytical_gain, injected_errors, swept_bounds
+from agents.stable_baselines import sb3_policy
 from agents.tuning import Tuned, tune
 from agents.velocity_law import VelocityLaw
 
@@ -42,6 +43,7 @@ __all__ = [
     "make_law",
     "make_policy",
     "play",
+    "sb3_policy",
     "swept_bounds",
     "tune",
 ]

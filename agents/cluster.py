@@ -13,7 +13,7 @@ def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator
     starts one on this machine, which ends with the last result.
 
     Args:
-        function: what to run; the workers need khop_env installed.
+        function: what to run; each task gets a copy of it, and the workers need khop_env installed.
         tasks: its arguments.
 
     Raises:
@@ -25,12 +25,13 @@ def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("a Ray cluster needs Ray: pip install 'khop_env[ray]'") from error
 
-    mine = not ray.is_initialized()
-    if mine:
+    started = not ray.is_initialized()
+    if started:
         ray.init(log_to_driver=False, include_dashboard=False, logging_level="warning")
+    waiting: dict[Any, int] = {}
     try:
-        remote = ray.remote(max_retries=3)(function)
-        waiting = {remote.remote(task): number for number, task in enumerate(tasks)}
+        remote, shared = ray.remote(max_retries=3)(_called), ray.put(function)
+        waiting = {remote.remote(shared, task): number for number, task in enumerate(tasks)}
         while waiting:
             ready, _ = ray.wait(list(waiting))
             for reference in ready:
@@ -39,5 +40,11 @@ def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator
                 except ray.exceptions.RayTaskError as error:
                     raise error.cause from None
     finally:
-        if mine:
+        for reference in waiting:  # after an error or Ctrl-C
+            ray.cancel(reference, force=True)
+        if started:
             ray.shutdown()
+
+
+def _called(function: Callable[[Any], Any], task: Any) -> Any:
+    return function(task)

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import concurrent.futures
+import contextlib
+import itertools
 import math
-import multiprocessing
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.evaluation import Episodes, play
+from agents.evaluation import Episodes, chosen_scenario, play
 from agents.learning.learned import LearnedPolicy
 from agents.policies import make_policy
 from agents.policy import EnvDescription, describe
+from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
-from khop_env.registry import make_batched, task_class
+from khop_env.registry import Environment, make_batched
 from khop_env.results.metrics import finite
 from khop_env.results.recording import Progress
+from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 CHUNK = 25  # episodes played at once; fixed, so that no number depends on who plays how many
 
 _Arguments = tuple[tuple[str, Any], ...]
-_Task = tuple[str, str, Observe, tuple[int, ...], _Arguments, str]
+_Task = tuple[str, Observe, _Arguments, tuple[int, ...]]  # policy, ..., seeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,22 +82,28 @@ class Comparison:
     Attributes:
         environment: its name.
         scenario: its name.
+        planned: episodes of each row; rows that were interrupted have fewer, or are missing.
         rows: in the order asked for.
     """
 
     environment: str
     scenario: str
+    planned: int
     rows: list[Row] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
-        """Everything that `khop evaluate --json` prints."""
-        count = len(self.rows[0].episodes.returns) if self.rows else 0
+        """Everything that `khop evaluate --json` prints; rows with fewer episodes than planned say how many."""
         rows = [row.summary() for row in self.rows]
-        return {"environment": self.environment, "scenario": self.scenario, "episodes": count, "rows": rows}
+        for row, seen in zip(self.rows, rows, strict=True):
+            if len(row.episodes.seed) < self.planned:
+                seen["episodes"] = len(row.episodes.seed)
+        return {"environment": self.environment, "scenario": self.scenario, "episodes": self.planned, "rows": rows}
 
     def difference(self, row: Row) -> tuple[float, float | None]:
         """How much more a row returns than the first, paired by episode, and the half width of the 95 % interval."""
-        more = row.episodes.returns - self.rows[0].episodes.returns
+        first = self.rows[0].episodes.returns
+        both = min(len(row.episodes.returns), len(first))
+        more = row.episodes.returns[:both] - first[:both]
         return float(more.mean()), interval95(more)
 
     def frame(self) -> pl.DataFrame:
@@ -106,11 +114,11 @@ class Comparison:
 
 
 def compare(
-    environment: str,
+    environment: Environment,
     policies: Sequence[str],
     observe: Sequence[Observe] = ("estimate",),
     *,
-    scenario: str | None = None,
+    scenario: Scenario | str | Path | None = None,
     seeds: Sequence[int] = range(100),
     workers: int = 1,
     ray: bool = False,
@@ -120,10 +128,10 @@ def compare(
     """Play every policy under every observation mode over the same episodes.
 
     Args:
-        environment: one of `khop_env.environments()`.
+        environment: one of `khop_env.environments()`, or a task of your own.
         policies: names that `make_policy` knows.
         observe: observation modes.
-        scenario: name or path; the environment's default if left out.
+        scenario: a scenario, its name or path; the environment's default if left out. A file is read once.
         seeds: one per episode.
         workers: processes; the numbers don't depend on how many.
         ray: play on a Ray cluster instead (the one that is running, or a local one).
@@ -134,37 +142,54 @@ def compare(
     Raises:
         ValueError: for anything unknown, before a policy plays.
         ModuleNotFoundError: for `ray` without Ray.
+        UnfinishedError: if a policy or a worker fails while it plays; it holds what was played until then.
+        Interrupted: a KeyboardInterrupt that holds the same; workers have ended.
     """
     if not len(seeds):
         raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
-    name = task_class(environment).default_scenario if scenario is None else scenario
+    for name, several in (("policies", policies), ("observe", observe)):
+        if isinstance(several, str):
+            raise ValueError(f"{name} is a list of names, e.g. [{several!r}]; got {several!r}")
     if not policies or not observe or len(set(observe)) < len(observe):
         raise ValueError(f"name at least one policy and one observation mode, each once; got {list(observe)}")
-    asked: dict[str, _Arguments] = {}
-    pairs: list[tuple[str, EnvDescription]] = []
-    for spec in policies:  # refuses what there isn't, or doesn't fit, before anything is played
+    player = _Player(environment, chosen_scenario(environment, scenario))
+    rows: list[tuple[str, EnvDescription, _Arguments]] = []
+    for spec in policies:  # refuses what doesn't fit before anything is played
         policy = make_policy(spec)
         with_bounds = {"bounds": True} if isinstance(policy, LearnedPolicy) and policy.about.get("bounds") else {}
-        asked[spec] = tuple(sorted({**with_bounds, **(arguments or {})}.items()))
+        chosen = tuple(sorted({**with_bounds, **(arguments or {})}.items()))
         for mode in observe:
-            env = describe(_environment(environment, name, mode, asked[spec]))
-            pairs.append((spec, env))
+            env = describe(player.environment(mode, chosen))
+            rows.append((spec, env, chosen))
             try:
                 policy.reset(env, [0])
             except ValueError as error:
                 raise ValueError(f"policy {spec!r}: {error}") from error
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
-    tasks: list[_Task] = [
-        (environment, name, mode, chunk, asked[spec], spec) for spec in policies for mode in observe for chunk in chunks
-    ]
-    results: list[Any] = [None] * len(tasks)
-    for done, (number, result) in enumerate(_run(tasks, workers, ray), 1):
-        results[number] = result
-        if progress is not None:
-            progress(done / len(tasks))
-    parts = [results[first : first + len(chunks)] for first in range(0, len(tasks), len(chunks))]
-    rows = [Row(spec, where, Episodes.joined(mine)) for (spec, where), mine in zip(pairs, parts, strict=True)]
-    return Comparison(environment, env.scenario, rows)
+    tasks: list[_Task] = [(spec, env.observe, chosen, chunk) for spec, env, chosen in rows for chunk in chunks]
+    results: list[Episodes | None] = [None] * len(tasks)
+
+    def comparison() -> Comparison:
+        found = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds))
+        for number, (spec, env, _) in enumerate(rows):
+            parts = list(itertools.takewhile(bool, results[number * len(chunks) : (number + 1) * len(chunks)]))
+            if parts:
+                found.rows.append(Row(spec, env, Episodes.joined(parts)))  # type: ignore[arg-type]
+        return found
+
+    try:
+        with contextlib.closing(_run(player, tasks, workers, ray)) as played:
+            for done, (number, result) in enumerate(played, 1):
+                results[number] = result
+                if progress is not None:
+                    progress(done / len(tasks))
+    except KeyboardInterrupt:
+        raise Interrupted(comparison()) from None
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:
+        raise UnfinishedError(str(error), comparison()) from error
+    return comparison()
 
 
 def interval95(values: FloatArray) -> float | None:
@@ -184,32 +209,37 @@ def interval95(values: FloatArray) -> float | None:
     return t * float(np.std(values, ddof=1)) / math.sqrt(len(values))
 
 
-def _run(tasks: Sequence[_Task], workers: int, ray: bool) -> Iterator[tuple[int, Episodes]]:
+class _Player:
+    """Plays tasks, in environments that are made once for each kind of observation, and belong to this object alone."""
+
+    def __init__(self, environment: Environment, scenario: Scenario) -> None:
+        self._environment, self._scenario = environment, scenario
+        self._made: dict[tuple[Observe, _Arguments], BatchedEnv] = {}
+
+    def environment(self, observe: Observe, arguments: _Arguments) -> BatchedEnv:
+        """The environment, of CHUNK copies."""
+        if (observe, arguments) not in self._made:
+            env = make_batched(self._environment, self._scenario, num_envs=CHUNK, observe=observe, **dict(arguments))
+            self._made[observe, arguments] = env
+        return self._made[observe, arguments]
+
+    def __call__(self, task: _Task) -> Episodes:
+        spec, observe, arguments, seeds = task
+        return play(self.environment(observe, arguments), make_policy(spec), seeds, name=spec)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_made": {}}
+
+
+def _run(
+    player: _Player, tasks: Sequence[_Task], workers: int, ray: bool
+) -> Generator[tuple[int, Episodes], None, None]:
     """Number and result of each task, as they come."""
     if ray:
         from agents.cluster import run_on_ray
 
-        yield from run_on_ray(_play_task, tasks)
-    elif workers <= 1:
-        for number, task in enumerate(tasks):
-            yield number, _play_task(task)
+        yield from run_on_ray(player, tasks)
+    elif workers > 1:
+        yield from run_in_processes(player, tasks, workers)
     else:
-        spawned = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(min(workers, len(tasks)), mp_context=spawned) as pool:
-            futures = {pool.submit(_play_task, task): number for number, task in enumerate(tasks)}
-            try:
-                for future in concurrent.futures.as_completed(futures):
-                    yield futures[future], future.result()
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _play_task(task: _Task) -> Episodes:
-    environment, scenario, observe, seeds, arguments, spec = task
-    env = _environment(environment, scenario, observe, arguments)
-    return play(env, make_policy(spec), seeds, name=spec)
-
-
-@lru_cache(maxsize=6)  # three modes, with and without bounds
-def _environment(environment: str, scenario: str, observe: Observe, arguments: _Arguments) -> BatchedEnv:
-    return make_batched(environment, scenario, num_envs=CHUNK, observe=observe, **dict(arguments))
+        yield from enumerate(map(player, tasks))

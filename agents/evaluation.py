@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +14,10 @@ from agents.policies import make_policy
 from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
+from khop_env.registry import Environment, find_task
+from khop_env.registry import scenario as load_scenario
 from khop_env.results.recording import Progress
+from khop_env.scenarios import Scenario
 
 if TYPE_CHECKING:
     import polars as pl
@@ -74,6 +79,16 @@ class Episodes:
         return pl.DataFrame({**where, **numbers})
 
 
+def chosen_scenario(environment: Environment, scenario: Scenario | str | Path | None) -> Scenario:
+    """A scenario that may be given by name or path, or left out for the environment's own.
+
+    Raises:
+        ValueError: for an unknown environment or scenario, naming the nearest.
+    """
+    chosen = find_task(environment).default_scenario if scenario is None else scenario
+    return chosen if isinstance(chosen, Scenario) else load_scenario(chosen)
+
+
 def evaluate(
     env: object,
     policies: Mapping[str, Policy] | Sequence[str],
@@ -84,8 +99,9 @@ def evaluate(
     """Play every policy over the same episodes.
 
     Args:
-        env: an environment of khop_env; a batch of B plays B episodes at once. It is reset, and left at an end.
-        policies: by name, or names that `make_policy` knows.
+        env: an environment of khop_env of any kind, wrapped or not; a batch of B plays B episodes at once. Wrappers
+            have no part: policies get the environment's own observations. It is reset, and left at an end.
+        policies: by name, or a list of names that `make_policy` knows.
         seeds: one per episode; episodes of different policies with the same seed have the same initial states,
             disturbances and leaders, so that differences can be paired.
         progress: told how far it is.
@@ -95,11 +111,14 @@ def evaluate(
         the columns of `Episodes`.
 
     Raises:
+        TypeError: for an environment or a policy that isn't one.
         ValueError: for an unknown policy, no seed, or actions that the environment refuses.
     """
     import polars as pl
 
     batched = batched_of(env)
+    if isinstance(policies, str) or not isinstance(policies, Mapping | Sequence):
+        raise TypeError(f"policies are a list of names or a mapping, e.g. {{'mine': policy}}; got {policies!r}")
     chosen = policies if isinstance(policies, Mapping) else {spec: make_policy(spec) for spec in policies}
     description = describe(batched)
     frames = []
@@ -116,16 +135,18 @@ def play(
     """Play one policy, as many episodes at once as the environment has copies.
 
     Args:
-        env: an environment of khop_env.
+        env: as for `evaluate`.
         policy: who plays.
         seeds: one per episode.
         name: of the policy, for errors.
         progress: told how far it is.
 
     Raises:
+        TypeError: for an environment or a policy that isn't one.
         ValueError: for no seed, or where policy and environment don't fit.
     """
     batched = batched_of(env)
+    _require_policy(policy, name)
     if not len(seeds):
         raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
     parts = []
@@ -152,9 +173,8 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
     error[0] = infos["task_error"].mean(axis=1)
     running, length = np.ones(env.num_envs, bool), np.full(env.num_envs, horizon)
     for cycle in range(1, horizon + 1):
-        actions = policy.act(by_agent(env, observations))
-        given = _stacked(env, actions)
-        observations, reward, terminated, truncated, infos = env.step(given)
+        actions = _by_agent(env, policy.act(by_agent(env, observations)))
+        observations, reward, terminated, truncated, infos = env.step(np.concatenate(list(actions.values()), axis=1))
         returns += np.where(running, reward.mean(axis=1), 0.0)
         squared = [
             np.square(np.clip(actions[agent][:, :m], -1.0, 1.0, dtype=np.float64)).sum(axis=1)
@@ -194,18 +214,47 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
     )
 
 
-def _stacked(env: BatchedEnv, actions: Mapping[str, Any]) -> np.ndarray:
-    """Actions by agent as the arrays that the environment takes.
+def _require_policy(policy: object, name: str) -> None:
+    """Refuse what isn't a policy.
 
     Raises:
-        ValueError: for actions that are missing or misshapen.
+        TypeError: saying what one is.
+    """
+    if isinstance(policy, type):
+        raise TypeError(f"policy {name!r} is the class {policy.__name__}: give an object of it")
+    if not all(callable(getattr(policy, one, None)) for one in ("reset", "act")):
+        how = "a policy has reset(env, seeds) and act(observations); agents.make_policy makes one of a name"
+        if callable(getattr(policy, "predict", None)):
+            how = "agents.sb3_policy makes a policy of a Stable-Baselines3 model"
+        raise TypeError(f"policy {name!r} is of type {type(policy).__name__}: {how}")
+
+
+def _by_agent(env: BatchedEnv, actions: object) -> dict[str, np.ndarray]:
+    """A policy's actions (B, m_i) as arrays.
+
+    Raises:
+        ValueError: for actions that are missing or misshapen, or aren't numbers by agent.
     """
     sizes = (env.action_offset[1:] - env.action_offset[:-1]).tolist()
+    if not isinstance(actions, Mapping):
+        what = f"an array of shape {actions.shape}" if isinstance(actions, np.ndarray) else type(actions).__name__
+        raise ValueError(
+            f"act(observations) has to return actions by agent, {{{env.agents[0]!r}: array of shape "
+            f"{(env.num_envs, sizes[0])}, ...}}; got {what}"
+        )
+    found = {}
     for agent, size in zip(env.agents, sizes, strict=True):
         if agent not in actions:
             raise ValueError(f"no action for {agent!r}; got some for {', '.join(list(actions)[:8]) or 'nobody'}")
-        if np.shape(actions[agent]) != (env.num_envs, size):
+        try:
+            found[agent] = np.asarray(actions[agent])
+        except ValueError:  # lists of different lengths
+            found[agent] = np.asarray(None)
+        if found[agent].dtype.kind not in "fiu":
+            raise ValueError(f"actions of {agent!r} aren't numbers: {reprlib.repr(actions[agent])}")
+        if found[agent].shape != (env.num_envs, size):
             raise ValueError(
-                f"actions of {agent!r} must have shape {(env.num_envs, size)}; got {np.shape(actions[agent])}"
+                f"actions of {agent!r} must have shape {(env.num_envs, size)}, one row for each copy of the "
+                f"environment; got {found[agent].shape}"
             )
-    return np.concatenate([actions[agent] for agent in env.agents], axis=1)
+    return found

@@ -31,6 +31,7 @@ class FormationLaw(VelocityLaw):
     gain: float = 2.0
     speed: float = 3.0
     cancel_drift: bool = True
+    averages = True
 
     def __post_init__(self) -> None:
         self.require_positive("gain", "speed")

@@ -10,6 +10,7 @@ from agents.consensus import LinearConsensus, TanhConsensus
 from agents.formation import FormationLaw
 from agents.leader_following import LeaderFollowingLaw
 from khop_env.physics import did_you_mean
+from khop_env.registry import parameters_from_text
 from khop_env.scenarios import LawChoice
 from khop_env.scenarios.checked import describe, fits
 from khop_env.simulation import Law
@@ -35,14 +36,19 @@ class LawError(ValueError):
 
 
 def make_law(choice: LawChoice | str) -> Law:
-    """The law of a scenario, e.g. `make_law(scenario.law)`, or one by name with default parameters.
+    """The law of a scenario, e.g. `make_law(scenario.law)`, or one by name: "tanh", "linear:gain=2,cancel_drift=true".
 
     Raises:
         LawError: for an unknown name or parameter, or a parameter of the wrong type or value.
     """
-    choice = LawChoice(choice) if isinstance(choice, str) else choice
-    if choice.name not in LAWS:
-        raise LawError(f"no law {choice.name!r}; {did_you_mean(choice.name, LAWS)}")
+    name, _, text = choice.partition(":") if isinstance(choice, str) else (choice.name, "", "")
+    if name not in LAWS:
+        raise LawError(f"no law {name!r}; {did_you_mean(name, LAWS)}")
+    if isinstance(choice, str):
+        try:
+            choice = LawChoice(name, parameters_from_text(text, get_type_hints(LAWS[name]), f"law {choice!r}"))
+        except ValueError as error:
+            raise LawError(str(error)) from error
     make = LAWS[choice.name]
     known = inspect.signature(make).parameters
     hints = get_type_hints(make)

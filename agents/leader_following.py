@@ -34,6 +34,7 @@ class LeaderFollowingLaw(VelocityLaw):
     gain: float = 3.0
     shrink: float = 1.0
     cancel_drift: bool = True
+    averages = True
 
     def __post_init__(self) -> None:
         self.require_positive("gain")

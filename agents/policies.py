@@ -9,8 +9,9 @@ from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import Policy
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
+from khop_env.objects import is_object_name, load_object
 from khop_env.physics import did_you_mean
-from khop_env.registry import parameters_from_text
+from khop_env.registry import environments, parameters_from_text
 
 FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy]] = {
     "zero": ZeroPolicy,
@@ -29,18 +30,27 @@ def make_policy(spec: str) -> Policy:
         make_policy("zero")
         make_policy("ppo:runs/mine")         # what khop train learned: its folder, or one of the .npz files in it
         make_policy("ppo:pretrained")        # shipped with the library, for some environments and scenarios
+        make_policy("ppo:pretrained/consensus_v0")  # the one for this environment
+        make_policy("my_file.py:MyPolicy")   # a class of your own, or an object; "my_module:MyPolicy" likewise
 
     Raises:
         ValueError: for an unknown name or parameter, naming the nearest, a wrong value, or a file that isn't a policy.
     """
     name, _, given = spec.partition(":")
+    if name not in (*POLICIES, *ALGORITHMS) and is_object_name(spec):
+        return _policy_of_your_own(spec)
     if name in ALGORITHMS:
         if not given:
             raise ValueError(f"policy {spec!r}: say which, {name}:FOLDER or {name}:pretrained")
-        if given == "pretrained":
+        if given == "pretrained" or given.startswith("pretrained/"):
             if name != "ppo":
                 raise ValueError(f"policy {spec!r}: the shipped policies are ppo:pretrained")
-            return PretrainedPolicy()
+            environment = given.partition("/")[2] or None
+            if environment not in (None, *environments()):
+                raise ValueError(
+                    f"policy {spec!r}: no environment {environment!r}; {did_you_mean(environment, environments())}"
+                )
+            return PretrainedPolicy(environment)
         policy = LearnedPolicy.load(given)
         if policy.about["algorithm"] != name:
             raise ValueError(f"policy {spec!r}: {given} was trained by {policy.about['algorithm']}")
@@ -53,3 +63,14 @@ def make_policy(spec: str) -> Policy:
     if given:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
     return FLOOR[name]()
+
+
+def _policy_of_your_own(spec: str) -> Policy:
+    found = load_object(spec)
+    policy = found() if isinstance(found, type) else found
+    if not (callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None))):
+        raise ValueError(
+            f"policy {spec!r}: a policy has reset(env, seeds) and act(observations); got {type(policy).__name__} without"
+        )
+    checked: Policy = policy
+    return checked

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, ObservationLayout
+from khop_env.env import BatchedEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
 from khop_env.physics import AgentModel
 from khop_env.simulation import Observe
@@ -73,8 +73,8 @@ class Policy(Protocol):
         ...
 
 
-def describe(env: BatchedEnv | KHopEnv | KHopVectorEnv | JointEnv) -> EnvDescription:
-    """What a policy is told of an environment."""
+def describe(env: object) -> EnvDescription:
+    """What a policy is told of an environment, of any kind that `batched_of` knows."""
     batched = batched_of(env)
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
     return EnvDescription(
@@ -94,15 +94,23 @@ def policy_seeds(seeds: Sequence[int]) -> list[int]:
 
 
 def batched_of(env: object) -> BatchedEnv:
-    """The arrays behind an environment of any kind.
+    """The arrays behind an environment of any kind, wrapped or not; wrappers have no part in what is done with them.
 
     Raises:
         TypeError: for something else.
     """
-    found = env.env.batched if isinstance(env, JointEnv) else getattr(env, "batched", env)
-    if not isinstance(found, BatchedEnv):
-        raise TypeError(f"expected an environment of khop_env; got {type(env).__name__}")
-    return found
+    found = env
+    for _ in range(100):  # wrappers around each other
+        if isinstance(found, BatchedEnv):
+            return found
+        inner = (getattr(found, name, None) for name in ("batched", "unwrapped", "venv", "env", "par_env"))
+        found = next((one for one in inner if one is not None and one is not found), None)
+        if found is None:
+            break
+    raise TypeError(
+        f"expected an environment of khop_env, e.g. consensus_v0.parallel_env() or make_vec('consensus_v0', 32); got "
+        f"{type(env).__name__}"
+    )
 
 
 def by_agent(batched: BatchedEnv, observations: Float32Array) -> dict[str, Float32Array]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.learning.learned import PretrainedPolicy, pretrained_for
+from agents.learning.learned import PretrainedPolicy
 from agents.policies import make_policy
 from agents.policy import Policy, describe, policy_seeds
 from khop_env.env import KHopEnv, Settings
@@ -64,7 +64,7 @@ def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float,
     """A learned policy in the environment that it was trained for.
 
     Args:
-        spec: e.g. "ppo:runs/mine"; "ppo:pretrained" is the shipped one that there is for the scenario.
+        spec: e.g. "ppo:runs/mine"; "ppo:pretrained" is the only shipped one for the scenario.
         scenario: where it acts.
         observe: observation mode.
         duration: of the episode in s, rounded up to whole control periods.
@@ -74,7 +74,7 @@ def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float,
         PolicyFileError: for a policy that doesn't fit.
     """
     policy = make_policy(spec)
-    about = pretrained_for(scenario.name) if isinstance(policy, PretrainedPolicy) else policy.about  # type: ignore[attr-defined]
+    about = policy.about_for(scenario.name) if isinstance(policy, PretrainedPolicy) else policy.about  # type: ignore[attr-defined]
     cycles = max(1, math.ceil(duration / Settings.control_period - 1e-9))
     env = make(about["environment"], scenario, observe=observe, bounds=about["bounds"], max_cycles=cycles)
     return PolicyRun(env, policy, seed)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from agents.laws import make_law
 from agents.policy import EnvDescription, Observations
-from agents.tuned import tuned_parameters
+from agents.tuned import sampled_gain, tuned_parameters
+from agents.velocity_law import VelocityLaw
 from khop_env.env.layout import Float32Array
 from khop_env.physics import Fleet
 from khop_env.scenarios import LawChoice
@@ -76,7 +77,8 @@ class LawPolicy:
     Args:
         name: of the law.
         parameters: its parameters; those left out are the tuned ones for environment, scenario and observation mode
-            where there are any (`agents/tuned.toml`), otherwise the law's defaults.
+            where there are any (`agents/tuned.toml`), otherwise the law's defaults. A gain that is left out is lowered
+            for control periods that are too long for it (`agents.tuned.sampled_gain`); `law.gain` is what is used.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, Any] | None = None) -> None:
@@ -87,6 +89,8 @@ class LawPolicy:
         """Choose the parameters, and look up where in the observations everything is."""
         tuned = tuned_parameters(env, self.name)
         self.law = make_law(LawChoice(self.name, {**tuned, **self.parameters}))
+        if isinstance(self.law, VelocityLaw) and hasattr(self.law, "gain") and "gain" not in self.parameters:
+            self.law.gain = sampled_gain(self.law.gain, self.law.averages, env)
         self._env, self._time = env, 0.0
         self._view: View | None = None
         self._fleet = Fleet(list(env.models.values()))

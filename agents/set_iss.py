@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from agents.laws import make_law
 from agents.lyapunov import ComparisonGain
+from agents.workers import Interrupted, UnfinishedError
 from khop_env.observers import DesignError, Exponential, FloatArray, TargetObservers
 from khop_env.results.metrics import consensus_error, finite
 from khop_env.results.recording import Progress
@@ -109,14 +110,18 @@ def injected_errors(
         episodes), gain (distance over error), bound (what the analytical gain allows in the limit; None where there is
         none), all in m; and holds (whether every run kept to the comparison equation from where its last quarter began;
         None where that says nothing).
+
+    Raises:
+        Interrupted: a KeyboardInterrupt that holds the rows until then.
     """
     calm, bound, batch = scenario.replace(disturbance=None), analytical_gain(scenario), episodes * len(PATTERNS)
     edges = directed(calm.task)
     unheard = np.array([not calm.communication.has_edge(i, j) for i, j in edges.tolist()], bool)
     x0 = [calm.initial.draw(np.random.default_rng(seed + b // len(PATTERNS))) for b in range(batch)]
     steps = round(calm.duration / calm.dt)
-    rows = []
-    for number, size in enumerate(sizes):
+    rows: list[dict[str, Any]] = []
+
+    def inject(number: int, size: float) -> Iterator[dict[str, Any]]:
         rng = np.random.default_rng([seed, 2])  # the same directions for every size
         law = Misinformed(make_law(calm.law), size, unheard, rng, batch, calm.fleet.position_dim)
         simulator = calm.build(law=law, observe="oracle", num_envs=batch)
@@ -141,7 +146,13 @@ def injected_errors(
             worst = float(distance[mine].max())
             holds = bool(kept[mine].all()) if np.isfinite(limit[mine]).all() else None
             measured = {"distance": worst, "gain": worst / size, "bound": analytical, "holds": holds}
-            rows.append({"error": size, "pattern": pattern, **measured})
+            yield {"error": size, "pattern": pattern, **measured}
+
+    try:
+        for number, size in enumerate(sizes):
+            rows += inject(number, size)
+    except KeyboardInterrupt:
+        raise Interrupted(rows) from None
     return rows
 
 
@@ -177,6 +188,9 @@ def swept_bounds(
 
     Raises:
         ValueError: for bounds that aren't `Exponential`.
+        DesignError: for a factor that no observers can be designed with, before anything is simulated.
+        UnfinishedError: for states drawn at a start that the observers can't start from; it holds the rows until then.
+        Interrupted: a KeyboardInterrupt that holds the same.
     """
     designs: list[tuple[str, bool, float]] = [
         (kind, disturbed, factor)
@@ -184,8 +198,8 @@ def swept_bounds(
         for disturbed in (False, True)
         for factor in factors
     ]
-    rows = []
-    for number, (kind, disturbed, factor) in enumerate(designs):
+    variants = []
+    for kind, disturbed, factor in designs:
         if disturbed and scenario.disturbance is None:
             continue
         variant = with_final_bounds(scenario, factor)
@@ -196,14 +210,24 @@ def swept_bounds(
         if not disturbed:
             variant = variant.replace(disturbance=None)
         try:
-            measured = _paired(variant, episodes, seed)
+            variant.build()  # refused now, and not after minutes of others
         except DesignError as error:
             if kind == "bare":
                 continue  # inputs without a bound: they need their observers
             raise DesignError(f"delta(inf) x {factor:g}: {error}") from error
-        rows.append({"observers": kind, "disturbed": disturbed, "factor": factor, **measured})
-        if progress is not None:
-            progress((number + 1) / len(designs))
+        variants.append(({"observers": kind, "disturbed": disturbed, "factor": factor}, variant))
+    rows: list[dict[str, Any]] = []
+    try:
+        for number, (names, variant) in enumerate(variants, 1):
+            try:
+                rows.append({**names, **_paired(variant, episodes, seed)})
+            except DesignError as error:
+                if names["observers"] != "bare":
+                    raise UnfinishedError(f"delta(inf) x {names['factor']:g}: {error}", rows) from error
+            if progress is not None:
+                progress(number / len(variants))
+    except KeyboardInterrupt:
+        raise Interrupted(rows) from None
     return rows
 
 

@@ -12,6 +12,7 @@ from agents.evaluation import play
 from agents.laws import LAWS
 from agents.policy import batched_of, describe
 from agents.scripted import LawPolicy
+from agents.workers import Interrupted
 
 SEEDS = range(10_000, 10_064)
 """Episodes that parameters are tuned on; others than those that evaluation plays by default."""
@@ -53,6 +54,10 @@ def tune(
 
     Returns:
         Parameters to three digits. An optimum of this search need not be the global one.
+
+    Raises:
+        ValueError: if the law doesn't work with its default parameters.
+        Interrupted: a KeyboardInterrupt that holds the best until then.
     """
     batched = batched_of(env)
     names = [one.name for one in fields(LAWS[law])]  # type: ignore[arg-type]
@@ -70,15 +75,18 @@ def tune(
     if not math.isfinite(default):
         raise ValueError(f"{law!r} with its default parameters returns {default} in {describe(batched).environment}")
     improved, rounds = True, 0
-    while improved and rounds < 6:
-        improved, rounds = False, rounds + 1
-        for number, name in enumerate(names):
-            for candidate in _candidates(name, best[name]):
-                found = value({**best, name: candidate})
-                if found > top + _WORTH * abs(top):
-                    best, top, improved = {**best, name: candidate}, found, True
-            if progress is not None:
-                progress(1.0 - 0.5 ** (rounds - 1 + (number + 1) / len(names)))
+    try:
+        while improved and rounds < 6:
+            improved, rounds = False, rounds + 1
+            for number, name in enumerate(names):
+                for candidate in _candidates(name, best[name]):
+                    found = value({**best, name: candidate})
+                    if found > top + _WORTH * abs(top):
+                        best, top, improved = {**best, name: candidate}, found, True
+                if progress is not None:
+                    progress(1.0 - 0.5 ** (rounds - 1 + (number + 1) / len(names)))
+    except KeyboardInterrupt:
+        raise Interrupted(Tuned(best, top, default, len(known))) from None
     return Tuned(best, top, default, len(known))
 
 

@@ -26,9 +26,13 @@ class VelocityLaw:
 
     Attributes:
         cancel_drift: whether agents whose input is a velocity subtract their known drift.
+        gain: in 1/s, of laws that have one.
+        averages: whether a command is the gain times a mean over an agent's edges, and not times their sum.
     """
 
     cancel_drift: bool = False
+    gain: float
+    averages = False
 
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
         """Write commanded velocities (N, d, B), in m/s, from displacements (E, d, B) along `view.edges`, in m."""

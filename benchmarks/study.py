@@ -6,8 +6,6 @@ interrupted goes on where it was.
 
 from __future__ import annotations
 
-import concurrent.futures
-import multiprocessing
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +17,7 @@ import numpy as np
 
 from agents.comparison import Comparison, Row, compare, interval95
 from agents.learning.config import TrainingConfig
+from agents.workers import run_in_processes
 from khop_env.observers import Exponential, FloatArray
 from khop_env.registry import scenario
 from khop_env.simulation import OBSERVE, Observe
@@ -155,11 +154,9 @@ def train_all(
         if seconds_of(folder_of(root, task, variant, seed)) is None
     ]
     start = time.perf_counter()
-    spawned = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawned) as pool:
-        for done, text in enumerate(pool.map(_train, jobs), 1):
-            left = (time.perf_counter() - start) / done * (len(jobs) - done)
-            say(f"{done} of {len(jobs)}: {text}; about {left / 60:.0f} min left")
+    for done, (_, text) in enumerate(run_in_processes(_train, jobs, workers), 1):
+        left = (time.perf_counter() - start) / done * (len(jobs) - done)
+        say(f"{done} of {len(jobs)}: {text}; about {left / 60:.0f} min left")
 
 
 def measure(
@@ -310,7 +307,8 @@ def _verdict(ours: FloatArray, theirs: FloatArray) -> str:
 
 
 def _train(job: tuple[Path, StudyTask, str, int]) -> str:
-    from agents.learning.training import CHECKPOINT, train
+    from agents.learning.run_folder import CHECKPOINT
+    from agents.learning.training import train
 
     root, task, variant, seed = job
     folder = folder_of(root, task, variant, seed)

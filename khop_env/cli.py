@@ -1,7 +1,8 @@
 """The command line, `khop`.
 
 Tables and one JSON object (`--json`) go to stdout; progress and messages to stderr. Exit status: 0, or 1 where a check
-or a run finds the observers' guarantee or the environments' contract broken, or 2 for a mistake in what was asked.
+or a run finds the observers' guarantee or the environments' contract broken, or 2 for a mistake in what was asked, or
+where something failed on the way; 130 after Ctrl-C, where what was done until then is printed.
 """
 
 from __future__ import annotations

@@ -45,6 +45,15 @@ def load_object(name: str) -> Any:
     return found
 
 
+def is_object_name(name: str) -> bool:
+    """Whether a text is meant for `load_object`: "module:attribute", or a file that ends in .py."""
+    source, _, attribute = name.rpartition(":")
+    if name.endswith(".py") or source.endswith(".py"):
+        return True
+    parts = [*source.split("."), *attribute.split(".")]
+    return bool(source) and all(part.isidentifier() for part in parts)
+
+
 def described(error: BaseException, file: str = "") -> str:
     """An exception and where it was raised: "ValueError: no such fleet (my_file.py, line 3, in make_env)".
 

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 import khop_env.tasks
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
+from khop_env.objects import is_object_name, load_object
 from khop_env.observers import Proximal
 from khop_env.physics import did_you_mean
 from khop_env.scenarios.convoy import convoy
@@ -32,7 +33,8 @@ ScenarioFactory = Callable[..., Scenario]
 """A function that makes a scenario; the parameters of a family are int, float, bool or str, with defaults."""
 
 Environment: TypeAlias = str | Task | type[Task]
-"""An environment's name, or a task: an object, or a class that is made with the task's arguments."""
+"""An environment's name, or a task: an object, or a class that is made with the task's arguments; or where such an
+object or class is found, "my_module:MyTask" or "my_file.py:MyTask"."""
 
 SCENARIOS: dict[str, ScenarioFactory] = {
     factory.__name__: factory for factory in (paper, convoy, mixed_fleet, random_geometric)
@@ -54,15 +56,26 @@ def environments() -> tuple[str, ...]:
     return tuple(ENVIRONMENTS)
 
 
-def task_class(environment: str) -> type[Task]:
-    """The task that an environment plays.
+def find_task(environment: Environment) -> Task | type[Task]:
+    """The task that an environment plays: an object, or a class that is still to be given its arguments.
+
+    Args:
+        environment: one of `environments()`, a task of your own, or where it is found, "my_file.py:MyTask".
 
     Raises:
+        TypeError: for something else.
         ValueError: for an unknown environment; the message suggests the closest name.
     """
-    if environment not in ENVIRONMENTS:
-        raise ValueError(f"no environment {environment!r}; {did_you_mean(environment, ENVIRONMENTS)}")
-    found: type[Task] = getattr(khop_env.tasks, ENVIRONMENTS[environment])
+    found: Any = environment
+    if isinstance(environment, str):
+        if environment in ENVIRONMENTS:
+            found = getattr(khop_env.tasks, ENVIRONMENTS[environment])
+        elif is_object_name(environment):
+            found = load_object(environment)
+        else:
+            raise ValueError(f"no environment {environment!r}; {did_you_mean(environment, ENVIRONMENTS)}")
+    if not (isinstance(found, Task) or (isinstance(found, type) and issubclass(found, Task))):
+        raise TypeError(f"expected an environment's name or a Task; got {found!r} ({type(found).__name__})")
     return found
 
 
@@ -81,9 +94,7 @@ def make_batched(
         TypeError: for an unknown argument; the message suggests the closest one.
         ValueError: for an unknown environment or scenario, or a wrong argument.
     """
-    task = task_class(environment) if isinstance(environment, str) else environment
-    if not (isinstance(task, Task) or (isinstance(task, type) and issubclass(task, Task))):
-        raise TypeError(f"expected an environment's name or a Task; got {environment!r} ({type(environment).__name__})")
+    task = find_task(environment)
     if "render_mode" in arguments:
         raise TypeError(
             "got an unexpected keyword argument 'render_mode': batches aren't rendered; give it to the environment's "
@@ -264,9 +275,12 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
         scenario("random_geometric", agents=100, k=2)
         scenario("random_geometric:agents=100,k=2")
         scenario("mine.toml")
+        scenario("my_module:make_scenario")
+        scenario("my_file.py:scenario")
 
     Args:
-        name_or_path: a registered name, parameters of a family after a colon, or a path that ends in .toml.
+        name_or_path: a registered name, parameters of a family after a colon, a path that ends in .toml, or where a
+            `Scenario`, or a function that returns one, is found.
         parameters: parameters of a family; they win over those after the colon.
 
     Raises:
@@ -281,6 +295,12 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
             raise ValueError(f"a scenario file takes no parameters; got {', '.join(parameters)} with {text}")
         return read_scenario(text)
     name, _, given = text.partition(":")
+    if name not in SCENARIOS and is_object_name(text):
+        found = load_object(text)
+        made = found(**parameters) if callable(found) else found
+        if not isinstance(made, Scenario):
+            raise ValueError(f"{text} should be a Scenario or a function that returns one; got {type(made).__name__}")
+        return made
     if name not in SCENARIOS:
         if text.lower().endswith(".toml") or Path(text).is_file():
             raise ValueError(f"no scenario {text!r}; if it is a scenario file, rename it: such a name ends in .toml")

@@ -1,7 +1,8 @@
 """Learning: policies trained on estimated observations, and how they act afterwards."""
 
 from agents.learning.config import ALGORITHMS, TrainingConfig
-from agents.learning.learned import PRETRAINED, LearnedPolicy, PolicyFileError, PretrainedPolicy, pretrained_name
+from agents.learning.learned import PRETRAINED, LearnedPolicy, PretrainedPolicy, pretrained_name
+from agents.learning.policy_file import PolicyFileError
 from agents.learning.scaling import ObservationScaler
 
 __all__ = [

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
+from khop_env.registry import Environment, find_task
+from khop_env.scenarios import Scenario
 from khop_env.simulation import OBSERVE, Observe
 
 Algorithm = Literal["ppo", "sac"]
@@ -18,8 +21,8 @@ class TrainingConfig:
     """Every choice of a training run; the defaults are those that worked on every task of the library.
 
     Attributes:
-        environment: one of `khop_env.environments()`.
-        scenario: name or path; None for the environment's own.
+        environment: one of `khop_env.environments()`, or a task of your own.
+        scenario: name, path or `Scenario`; None for the environment's own.
         observe: "estimate", "oracle" or "local".
         bounds: whether observations hold the guaranteed bounds.
         rates: whether networks are shown how fast positions change, as differences of observations.
@@ -45,8 +48,8 @@ class TrainingConfig:
         ValueError: naming the attribute, what was given and what is expected.
     """
 
-    environment: str
-    scenario: str | None = None
+    environment: Environment
+    scenario: str | Path | Scenario | None = None
     observe: Observe = "estimate"
     bounds: bool = False
     rates: bool = True
@@ -94,5 +97,8 @@ class TrainingConfig:
                 raise ValueError(f"{name} must be from 0 to 1; got {getattr(self, name)!r}")
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return {**dataclasses.asdict(self), "hidden": list(self.hidden)}
+        """As JSON has it, the scenario by its name."""
+        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        name = self.scenario.name if isinstance(self.scenario, Scenario) else self.scenario and str(self.scenario)
+        environment = self.environment if isinstance(self.environment, str) else find_task(self.environment).name
+        return {**values, "environment": environment, "scenario": name, "hidden": list(self.hidden)}

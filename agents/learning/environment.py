@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from agents.learning.config import TrainingConfig
 from agents.learning.scaling import MOST, ObservationScaler
+from agents.policy import describe
 from khop_env.env import BatchedEnv
 from khop_env.env.layout import Float32Array
 from khop_env.env.sb3 import KHopSB3VecEnv
@@ -76,6 +77,6 @@ class TrainingVecEnv(VecEnvWrapper):
 def training_environment(config: TrainingConfig) -> VecNormalize:
     """What Stable-Baselines3 is given; only rewards are normalised by running statistics."""
     batched = build(config)
-    scaler = ObservationScaler.of(batched.layouts, batched.settings.control_period, config.rates)
+    scaler = ObservationScaler.of(describe(batched), config.rates)
     wrapped = TrainingVecEnv(KHopSB3VecEnv(batched), scaler, config.huber)
     return VecNormalize(wrapped, norm_obs=False, norm_reward=True, gamma=config.gamma)

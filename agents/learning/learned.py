@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from agents.learning.policy_file import Layers, PolicyFileError, read_policy, write_policy
 from agents.learning.scaling import RATE, ObservationScaler
 from agents.policy import EnvDescription, Observations
 from khop_env.env.layout import Float32Array
 
-FORMAT = 1
-_SCALER = ("scale", "valid", "moving", "rate", "headed", "heading", "planar")
 PRETRAINED = Path(__file__).with_name("pretrained")
-
-Layers = tuple[tuple[Float32Array, Float32Array], ...]
-"""(weight (out, in), bias (out,)) of each layer; ReLU between them."""
-
-
-class PolicyFileError(ValueError):
-    """A policy that can't be read, or doesn't fit; the message says which file and what is wrong."""
 
 
 @dataclass(eq=False)
@@ -117,24 +107,7 @@ class LearnedPolicy:
 
     def save(self, path: Path) -> None:
         """Write everything into one .npz file."""
-        meta = {
-            "format": FORMAT,
-            "environment": self.environment,
-            "columns": list(self.columns),
-            "action_size": self.action_size,
-            "squash": self.squash,
-            "types": list(self.networks),
-            "layers": {kind: len(layers) for kind, layers in self.networks.items()},
-            "about": dict(self.about),
-        }
-        arrays: dict[str, Any] = {name: getattr(self.scaler, name) for name in _SCALER}
-        for kind, layers in self.networks.items():
-            for number, (weight, bias) in enumerate(layers):
-                arrays[f"{kind}/{number}/weight"], arrays[f"{kind}/{number}/bias"] = weight, bias
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.part.npz")
-        np.savez_compressed(partial, meta=np.array(json.dumps(meta)), **arrays)
-        partial.replace(path)  # a reader, or a kill, never finds half a file
+        write_policy(path, {one.name: getattr(self, one.name) for one in fields(self) if one.init})
 
     @classmethod
     def load(cls, path: str | Path) -> LearnedPolicy:
@@ -151,33 +124,18 @@ class LearnedPolicy:
             path = path / "best.npz"
         if not path.exists():
             raise PolicyFileError(f"there is no policy {path}; khop train writes a folder with best.npz and last.npz")
-        try:
-            with np.load(path) as stored:
-                meta = json.loads(str(stored["meta"]))
-                if meta["format"] != FORMAT:
-                    raise PolicyFileError(f"{path}: its format is {meta['format']}, this version reads {FORMAT}")
-                networks = {
-                    kind: tuple((stored[f"{kind}/{q}/weight"], stored[f"{kind}/{q}/bias"]) for q in range(count))
-                    for kind, count in meta["layers"].items()
-                }
-                scaler = ObservationScaler(**{name: stored[name] for name in _SCALER})
-        except PolicyFileError:
-            raise
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise PolicyFileError(f"{path} isn't a policy that khop train wrote ({error})") from error
-        return cls(
-            meta["environment"],
-            tuple(meta["columns"]),
-            meta["action_size"],
-            meta["squash"],
-            networks,
-            scaler,
-            meta["about"],
-        )
+        return cls(**read_policy(path))
 
 
 class PretrainedPolicy:
-    """The shipped policy for an environment and scenario, found when it is known which these are."""
+    """The shipped policy for an environment and scenario, found when it is known which these are.
+
+    Args:
+        environment: what it was trained for; None for wherever it plays.
+    """
+
+    def __init__(self, environment: str | None = None) -> None:
+        self.environment = environment
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Load it.
@@ -185,8 +143,9 @@ class PretrainedPolicy:
         Raises:
             PolicyFileError: if none is shipped for this environment and scenario, or it doesn't fit.
         """
-        stem = pretrained_name(env.environment, env.scenario)
-        path = PRETRAINED / f"{stem}.npz"
+        if self.environment not in (None, env.environment):
+            raise PolicyFileError(f"the policy for {self.environment} was asked for, and this is {env.environment}")
+        path = PRETRAINED / f"{pretrained_name(env.environment, env.scenario)}.npz"
         if not path.exists():
             raise PolicyFileError(
                 f"no pretrained policy for {env.environment} on {env.scenario}; there are: {_shipped()}. "
@@ -199,23 +158,26 @@ class PretrainedPolicy:
         """Its actions."""
         return self._policy.act(observations)
 
+    def about_for(self, scenario: str) -> Mapping[str, Any]:
+        """How the policy for a scenario, by name, was trained.
+
+        Raises:
+            PolicyFileError: if none is shipped for it, or several are and no environment was named.
+        """
+        ending = pretrained_name(self.environment or "", scenario)
+        found = sorted(path for path in PRETRAINED.glob("*.npz") if path.stem.endswith(ending))
+        if not found:
+            wanted = f"{self.environment} on {scenario}" if self.environment else scenario
+            raise PolicyFileError(f"no pretrained policy for {wanted}; there are: {_shipped()}")
+        if len(found) > 1:
+            names = " or ".join(f"ppo:pretrained/{path.stem.removesuffix(ending)}" for path in found)
+            raise PolicyFileError(f"there are {len(found)} pretrained policies for {scenario}: choose {names}")
+        return LearnedPolicy.load(found[0]).about
+
 
 def pretrained_name(environment: str, scenario: str) -> str:
     """File name, without ending, of the shipped policy for an environment on a scenario, both by name."""
     return f"{environment}@{scenario.replace(':', '-').replace(',', '-').replace('=', '')}"
-
-
-def pretrained_for(scenario: str) -> Mapping[str, Any]:
-    """How the first shipped policy for a scenario was trained.
-
-    Raises:
-        PolicyFileError: if none is shipped for it.
-    """
-    ending = pretrained_name("", scenario)
-    for path in sorted(PRETRAINED.glob("*.npz"), reverse=True):  # leader following first
-        if path.stem.endswith(ending):
-            return LearnedPolicy.load(path).about
-    raise PolicyFileError(f"no pretrained policy for {scenario}; there are: {_shipped()}")
 
 
 def _shipped() -> str:

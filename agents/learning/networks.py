@@ -14,7 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from agents.learning.config import TrainingConfig
-from agents.learning.learned import Layers, LearnedPolicy
+from agents.learning.learned import LearnedPolicy
+from agents.learning.policy_file import Layers
 from agents.learning.scaling import ObservationScaler
 
 
@@ -175,6 +176,7 @@ def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers
 def exported(
     model: BaseAlgorithm,
     config: TrainingConfig,
+    environment: str,
     columns: Sequence[str],
     types: Sequence[str],
     scaler: ObservationScaler,
@@ -185,6 +187,7 @@ def exported(
     Args:
         model: PPO or SAC.
         config: of the run.
+        environment: name of the environment.
         columns: names of the observation's columns.
         types: of agents.
         scaler: of observations.
@@ -193,7 +196,7 @@ def exported(
     shape = model.action_space.shape
     assert shape is not None
     squash, networks = config.algorithm == "sac", actor_layers(model, types)
-    return LearnedPolicy(config.environment, tuple(columns), int(shape[0]), squash, networks, scaler, about)
+    return LearnedPolicy(environment, tuple(columns), int(shape[0]), squash, networks, scaler, about)
 
 
 def _mlp(features: int, hidden: Sequence[int]) -> nn.Sequential:

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.policy import EnvDescription
 from khop_env.env import ObservationLayout
 from khop_env.env.layout import Float32Array
+from khop_env.tasks.edges import axis_names
 
 METRE = 0.5  # a network's unit is 2 m, or 2 m/s
 RATE = 0.25  # and 4 m/s in how fast positions change
@@ -44,40 +46,37 @@ class ObservationScaler:
     planar: NDArray[np.int64]
 
     @classmethod
-    def of(cls, layouts: Sequence[ObservationLayout], control_period: float, rates: bool) -> ObservationScaler:
+    def of(cls, env: EnvDescription, rates: bool) -> ObservationScaler:
         """Scales by unit.
 
         Args:
-            layouts: of all agents, uniform.
-            control_period: in s.
+            env: the environment, with uniform observations.
             rates: whether features hold changes.
+
+        Raises:
+            ValueError: for agents whose positions stand in different columns.
         """
+        layouts = list(env.layouts.values())
         units = zip(*([field.unit for field in layout.fields] for layout in layouts), strict=True)
         scale = np.array([min(METRE if unit in ("m", "m/s") else 1.0 for unit in each) for each in units], np.float32)
-        layout = max(layouts, key=lambda layout: len(layout.slots))
-        names = layout.names
+        names = max(layouts, key=lambda layout: len(layout.slots)).names
         valid = np.full(len(names), len(names))
-        positions = list(layout.columns("slot0.position"))
-        moving = list(range(len(positions)))  # an observation begins with the own position
         for column, name in enumerate(names):
             slot, _, rest = name.partition(".")
             if slot.startswith("slot") and rest != "valid":
                 valid[column] = names.index(f"{slot}.valid")
-            if slot.startswith("slot") and rest.startswith("position."):
-                moving.append(column)
-        if not rates:
-            moving = []
+        own = _own_position(env)
+        moving = [*own, *_vectors(names, len(own), "position")] if rates else []
         headed, heading = _headings(layouts)
         planar = []
-        if len(positions) == 2:
-            relative = [q for q, name in enumerate(names) if ".position." in name or ".displacement." in name]
-            relative += [len(names) + q for q, column in enumerate(moving) if column in relative]
-            planar = relative if len(headed) else []
+        if len(own) == 2 and len(headed):
+            planar = _vectors(names, 2, "position", "displacement")
+            planar += [len(names) + q for q, column in enumerate(moving) if column in planar]
         return cls(
             scale,
             valid,
             np.array(moving, np.int64),
-            RATE / control_period,
+            RATE / env.control_period,
             headed,
             heading,
             np.array(planar, np.int64).reshape(-1, 2),
@@ -114,6 +113,24 @@ class ObservationScaler:
             features[..., self.planar[:, 0]] = cos * x + sin * y
             features[..., self.planar[:, 1]] = cos * y - sin * x
         return features
+
+
+def _vectors(names: Sequence[str], dim: int, *kinds: str) -> list[int]:
+    """Columns of vectors "slotN.KIND.AXIS", axis by axis."""
+    split = [name.rpartition(".")[0] for name in names]
+    found = dict.fromkeys(prefix for prefix in split if prefix.rpartition(".")[2] in kinds)
+    return [names.index(f"{prefix}.{axis}") for prefix in found for axis in axis_names(dim)]
+
+
+def _own_position(env: EnvDescription) -> tuple[int, ...]:
+    """Columns of an agent's own position, axis by axis, which have to be the same for all agents."""
+    found = {
+        agent: tuple(env.layouts[agent].index(f"own.{name}") for name in model.position)
+        for agent, model in env.models.items()
+    }
+    if len(set(found.values())) > 1:
+        raise ValueError(f"own positions have to stand in the same columns for all agents; got {found}")
+    return next(iter(found.values()))
 
 
 def _headings(layouts: Sequence[ObservationLayout]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

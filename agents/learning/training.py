@@ -2,41 +2,43 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import importlib.metadata
-import io
 import json
-import pickle
 import platform
-import random
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 import khop_env
-from agents.evaluation import play
+from agents.evaluation import chosen_scenario, play
+from agents.learning.checkpoint import CheckpointError, model_state, restore_model, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
 from agents.learning.environment import TrainingVecEnv, build, training_environment
+from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
-from agents.policy import describe
+from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, write
+from agents.policy import EnvDescription, Observations, Policy, describe
+from khop_env.env.layout import Float32Array
 
 EVALUATION_SEEDS = range(20_000, 20_032)
 """Of the episodes that decide which policy is the best; others than those that are tuned or reported on."""
 
 _FIRST_SEED = 1_000_000  # training episodes are drawn from generators seeded from here on
-CHECKPOINT = "checkpoint.pkl"
+_RUNNING = ("mean", "var", "count")  # of discounted rewards, by which training divides them
 
 Told = Callable[[float, "Evaluation | None"], None]
 """Called now and then with the fraction that is done, and the evaluation if there was one."""
@@ -82,59 +84,79 @@ def train(
     """Train a policy.
 
     The folder gets config.json (settings and library versions), curve.csv, best.npz and last.npz (policies with their
-    observation scales), checkpoint.pkl (all that continuing needs) and TensorBoard's logs. A keyboard interrupt saves
+    observation scales), checkpoint.npz (all that continuing needs) and TensorBoard's logs. A keyboard interrupt saves
     and returns. What is continued goes on as if it had not been interrupted, bit for bit with PPO; SAC begins with an
-    empty replay buffer.
+    empty replay buffer. With more `timesteps` than before, a run goes on beyond its end, with PPO's learning rate at
+    what it is that far from the new end.
 
     Args:
-        config: what to train; with `resume` it has to be the one of the folder.
+        config: what to train; with `resume` it has to be the one of the folder, but for larger `timesteps`.
         out: folder; None to keep everything in memory.
         resume: continue from the folder's checkpoint.
         told: what to tell of the progress.
 
     Raises:
         FileNotFoundError: for `resume` without a checkpoint.
-        FileExistsError: for a folder with a checkpoint, without `resume`.
-        ValueError: for an unknown environment or scenario, or `resume` with other settings.
+        FileExistsError: for a folder with a run in it, without `resume`, or with one that is going on.
+        CheckpointError: for a checkpoint that can't be read.
+        ValueError: for an unknown environment or scenario, or `resume` with other settings or another environment.
     """
     torch.set_num_threads(1)  # networks this small don't gain from more
     folder = None if out is None else Path(out)
-    run = _Run(config, folder, resume, told)
-    return run.learn()
+    config = dataclasses.replace(config, scenario=chosen_scenario(config.environment, config.scenario))
+    if folder is None or not (folder / CHECKPOINT).exists():
+        if resume:
+            raise FileNotFoundError(f"nothing to resume: there is no {CHECKPOINT} in {folder}")
+        if folder is None:
+            return _Run(config, None, None, told).learn()
+    with alone_in(folder):
+        saved = load_checkpoint(folder, config) if resume else None
+        if not resume and any((folder / name).exists() for name in (CHECKPOINT, "best.npz")):
+            raise FileExistsError(f"{folder} holds a training run; continue it with --resume, or choose another folder")
+        return _Run(config, folder, saved, told).learn()
+
+
+class _StopError(Exception):
+    """Ctrl-C came in the middle of an update or an evaluation."""
 
 
 class _Run(BaseCallback):
     """A run and its bookkeeping, as Stable-Baselines3's callback."""
 
-    def __init__(self, config: TrainingConfig, folder: Path | None, resume: bool, told: Told | None) -> None:
+    def __init__(
+        self, config: TrainingConfig, folder: Path | None, saved: Mapping[str, Any] | None, told: Told | None
+    ) -> None:
         super().__init__()
         self.config, self.folder, self.told = config, folder, told
-        saved = _load(folder, config) if resume else None
-        if not resume and folder is not None and (folder / CHECKPOINT).exists():
-            raise FileExistsError(f"{folder} holds a training run; continue it with --resume, or choose another folder")
         self.env: VecNormalize = training_environment(config)
         self.learner: TrainingVecEnv = self.env.venv  # type: ignore[assignment]
         self.batched = batched = self.learner.batched
+        self.fingerprint = fingerprint(chosen_scenario(config.environment, config.scenario), batched)
+        if saved is not None and (said := differences(saved["fingerprint"], self.fingerprint)):
+            raise ValueError(
+                f"{folder} holds a run in another environment: {said}; resume it with the scenario as it was, or train "
+                "in another folder"
+            )
         self.judge = build(config, len(EVALUATION_SEEDS))
         self.description = describe(batched)
         self.types = list(dict.fromkeys(model.type for model in batched.fleet.models))
         layout = batched.layouts[0]  # features begin with the observation's columns
         columns = [layout.index(f"own.type.{kind}") for kind in self.types]
         log = None if folder is None else str(folder / "tensorboard")
-        self.curve: list[Evaluation] = [] if saved is None else saved["curve"]
-        self.best = max((one.mean_return for one in self.curve), default=-np.inf)
         self.interrupted, self.resumed = False, saved is not None
-        self.seconds = 0.0 if saved is None else saved["seconds"]
-        if saved is None:
-            self.algorithm = make_model(config, self.env, columns, log)  # it seeds the environment, too
-            self.env.seed((config.seed + 1) * _FIRST_SEED)
-        else:
-            self.algorithm = _restore(saved, self, log)
+        self.algorithm = make_model(config, self.env, columns, log)  # it seeds the environment, too
+        self.env.seed((config.seed + 1) * _FIRST_SEED)
+        self.curve: list[Evaluation] = []
+        self.seconds = 0.0
+        if saved is not None:
+            self._restore(saved)
+        self.best = max((one.mean_return for one in self.curve), default=-np.inf)
         self.policy = self._exported()
+        for name in model_state(self.algorithm)["parameters"]:
+            if isinstance(optimizer := attrgetter(name)(self.algorithm), torch.optim.Optimizer):
+                optimizer.register_step_pre_hook(self._stop_if_interrupted)
         if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            if saved is None:
-                self._write_config(folder)
+            self._write_config(folder)
 
     def learn(self) -> Training:
         """Train to the end, or to the interrupt."""
@@ -148,7 +170,7 @@ class _Run(BaseCallback):
                     reset_num_timesteps=not self.resumed,
                     tb_log_name="run",
                 )
-            if not self.interrupted:
+                self._stop_if_interrupted()
                 self._evaluate()
                 self._save()
         if self.interrupted and self.folder is not None:
@@ -171,20 +193,28 @@ class _Run(BaseCallback):
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C end the training after the step that it comes in; a second one is an exception as usual."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
+        """Let Ctrl-C end the training after the step that it comes in, of an episode, an update or an evaluation.
 
-        def interrupt(*_: object) -> None:
-            self.interrupted = True
-            signal.signal(signal.SIGINT, before)
+        A second one is an exception as usual.
+        """
+        with contextlib.suppress(_StopError):
+            if threading.current_thread() is not threading.main_thread():
+                yield
+                return
 
-        before = signal.signal(signal.SIGINT, interrupt)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
+            def interrupt(*_: object) -> None:
+                self.interrupted = True
+                signal.signal(signal.SIGINT, before)
+
+            before = signal.signal(signal.SIGINT, interrupt)
+            try:
+                yield
+            finally:
+                signal.signal(signal.SIGINT, before)
+
+    def _stop_if_interrupted(self, *_: object) -> None:
+        if self.interrupted:
+            raise _StopError
 
     def _on_rollout_start(self) -> None:
         """Between updates: the policy is up to date, and the environment stands still."""
@@ -199,7 +229,7 @@ class _Run(BaseCallback):
         if self.curve and self.curve[-1].timesteps == self.algorithm.num_timesteps:
             return
         policy = self._exported()
-        episodes = play(self.judge, policy, EVALUATION_SEEDS, name=self.config.algorithm)
+        episodes = play(self.judge, _Stoppable(policy, self), EVALUATION_SEEDS, name=self.config.algorithm)
         found = Evaluation(
             self.algorithm.num_timesteps,
             float(episodes.returns.mean()),
@@ -219,12 +249,14 @@ class _Run(BaseCallback):
     def _exported(self) -> LearnedPolicy:
         about = {
             **self.config.as_dict(),
+            "environment": self.description.environment,
             "scenario": self.description.scenario,
             "trained": self.algorithm.num_timesteps,
             "versions": _versions(),
         }
         columns = columns_of(self.description)
-        return exported(self.algorithm, self.config, columns, self.types, self.learner.scaler, about)
+        environment = self.description.environment
+        return exported(self.algorithm, self.config, environment, columns, self.types, self.learner.scaler, about)
 
     def _save(self) -> None:
         if self.folder is None:
@@ -235,74 +267,62 @@ class _Run(BaseCallback):
             f"{one.timesteps},{one.mean_return!r},{one.final_task_error!r},{one.max_normalized_disagreement!r}"
             for one in self.curve
         ]
-        _write(self.folder / "curve.csv", ("\n".join(lines) + "\n").encode())
-        _write(self.folder / CHECKPOINT, pickle.dumps(_checkpoint(self)))
+        write(self.folder / "curve.csv", "\n".join(lines) + "\n")
+        write_checkpoint(self.folder / CHECKPOINT, self._checkpoint())
 
     def _write_config(self, folder: Path) -> None:
         text = {**self.config.as_dict(), "versions": _versions(), "agents": len(self.batched.agents)}
-        _write(folder / "config.json", (json.dumps(text, indent=2) + "\n").encode())
+        write(folder / "config.json", json.dumps(text, indent=2) + "\n")
+
+    def _checkpoint(self) -> dict[str, Any]:
+        """Everything that the next update depends on."""
+        return {
+            "config": self.config.as_dict(),
+            "fingerprint": self.fingerprint,
+            "model": model_state(self.algorithm),
+            "environment": self.batched.get_state(),
+            "rewards": {name: getattr(self.env.ret_rms, name) for name in _RUNNING} | {"returns": self.env.returns},
+            "before": self.learner.before,
+            "curve": self.curve,
+            "seconds": self.elapsed(),
+        }
+
+    def _restore(self, saved: Mapping[str, Any]) -> None:
+        """Bring everything into the state that was saved.
+
+        Raises:
+            CheckpointError: for what isn't such a state.
+        """
+        try:
+            self.env.reset()
+            self.batched.set_state(restored(self.batched.get_state(), saved["environment"], "environment"))
+            self.learner.before = restored(self.learner.before, saved["before"], "before")
+            rewards, running = saved["rewards"], self.env.ret_rms
+            if not all(np.shape(rewards[name]) == () and np.isfinite(rewards[name]) for name in _RUNNING):
+                raise ValueError("the running mean of the rewards isn't finite")
+            running.mean, running.var, running.count = (rewards[name] for name in _RUNNING)
+            self.env.returns = restored(self.env.returns, rewards["returns"], "returns")
+            self.curve = [restored(Evaluation(0, 0.0, 0.0, 0.0), point, "curve") for point in saved["curve"]]
+            self.seconds = float(saved["seconds"])
+            restore_model(self.algorithm, saved["model"])
+        except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RuntimeError) as error:
+            raise CheckpointError(
+                f"{self.folder}: its {CHECKPOINT} doesn't hold what continuing needs ({error})"
+            ) from error
 
 
-def _checkpoint(run: _Run) -> dict[str, Any]:
-    """Everything that the next update depends on."""
-    model, buffer = run.algorithm, io.BytesIO()
-    model.save(buffer)
-    return {
-        "config": run.config.as_dict(),
-        "model": buffer.getvalue(),
-        "environment": run.batched.get_state(),
-        "normalize": (run.env.ret_rms, run.env.returns),
-        "before": run.learner.before,
-        "last": (model._last_obs, model._last_episode_starts, model._last_original_obs),
-        "random": (torch.get_rng_state(), np.random.get_state(), random.getstate()),  # noqa: NPY002
-        "curve": run.curve,
-        "seconds": run.elapsed(),
-    }
+class _Stoppable:
+    """A policy that is interrupted between its actions."""
 
+    def __init__(self, policy: Policy, run: _Run) -> None:
+        self._policy, self._run = policy, run
 
-def _restore(saved: dict[str, Any], run: _Run, log: str | None) -> BaseAlgorithm:
-    """The model and the environment as they were when the checkpoint was written."""
-    config, env = run.config, run.env
-    kind = PPO if config.algorithm == "ppo" else SAC
-    model: BaseAlgorithm = kind.load(io.BytesIO(saved["model"]), device="cpu")
-    env.reset()
-    model.set_env(env, force_reset=False)
-    model.tensorboard_log = log
-    run.batched.set_state(saved["environment"])
-    run.learner.before = saved["before"]
-    env.ret_rms, env.returns = saved["normalize"]
-    model._last_obs, model._last_episode_starts, model._last_original_obs = saved["last"]
-    torch_state, numpy_state, python_state = saved["random"]
-    torch.set_rng_state(torch_state)
-    np.random.set_state(numpy_state)  # noqa: NPY002  # Stable-Baselines3 shuffles with it
-    random.setstate(python_state)
-    return model
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        self._policy.reset(env, seeds)
 
-
-def _load(folder: Path | None, config: TrainingConfig) -> dict[str, Any]:
-    """The checkpoint of a folder.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is of a run with other settings.
-    """
-    path = None if folder is None else folder / CHECKPOINT
-    if path is None or not path.exists():
-        raise FileNotFoundError(f"nothing to resume: there is no {CHECKPOINT} in {folder}")
-    saved: dict[str, Any] = pickle.loads(path.read_bytes())
-    ours = config.as_dict()
-    differs = [key for key, value in saved["config"].items() if value != ours.get(key)]
-    if differs:
-        said = ", ".join(f"{key} = {saved['config'][key]!r} there and {ours.get(key)!r} here" for key in differs)
-        raise ValueError(f"{folder} holds a run with other settings: {said}; resume with the same")
-    return saved
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Replace a file at once, so that a kill never leaves half of it."""
-    partial = path.with_name(f".{path.name}.part")
-    partial.write_bytes(content)
-    partial.replace(path)
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        self._run._stop_if_interrupted()
+        return self._policy.act(observations)
 
 
 def _versions() -> dict[str, str]:

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from khop_env.scenarios import Scenario
 
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
+
 class ObserveOption(enum.StrEnum):
     """What the law sees of agents out of earshot."""
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from khop_env.commands.common import JsonOption, mistakes, print_json
+from khop_env.commands.common import INTERRUPTED, JsonOption, mistakes, print_json
 from khop_env.terminal import Progress, print_table, say, waiting
 
 if TYPE_CHECKING:
@@ -38,9 +38,14 @@ def evaluate(
     csv: Annotated[bool, typer.Option("--csv", help="Print a line per episode instead of the table.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Play policies over the same episodes, and print what they return and how well they do."""
-    from agents.comparison import compare
+    """Play policies over the same episodes, and print what they return and how well they do.
 
+    Where it is interrupted, or a worker or policy fails, what was played until then is printed all the same.
+    """
+    from agents.comparison import compare
+    from agents.workers import Interrupted, UnfinishedError
+
+    unfinished: tuple[str, int] | None = None  # why, and the exit status
     with mistakes():
         if csv and as_json:
             raise ValueError("--csv and --json: choose one of them")
@@ -49,31 +54,51 @@ def evaluate(
                 raise ValueError(f"--figure {figure}: a figure's name ends in .png, .pdf or .svg")
             figure.parent.mkdir(parents=True, exist_ok=True)  # before anything is played that could be lost
         with Progress(f"playing {environment}") as progress:
-            comparison = compare(
-                environment,
-                split_policies(policies),
-                [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
-                scenario=scenario,
-                seeds=range(seed, seed + episodes),
-                workers=workers,
-                ray=ray,
-                progress=progress,
-            )
+            try:
+                comparison = compare(
+                    environment,
+                    split_policies(policies),
+                    [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
+                    scenario=scenario,
+                    seeds=range(seed, seed + episodes),
+                    workers=workers,
+                    ray=ray,
+                    progress=progress,
+                )
+            except Interrupted as error:
+                comparison, unfinished = error.partial, ("interrupted", INTERRUPTED)
+            except UnfinishedError as error:
+                comparison, unfinished = error.partial, (str(error), 2)
+    if comparison.rows:
+        _print(comparison, csv, as_json)
+        if figure is not None:
+            _draw(comparison, figure)
+    if unfinished is not None:
+        why, status = unfinished
+        say(f"khop: {why}; {'above is what' if comparison.rows else 'nothing'} was played until then")
+        raise typer.Exit(status)
+
+
+def _print(comparison: Comparison, csv: bool, as_json: bool) -> None:
     if as_json:
         print_json(comparison.summary())
     elif csv:
         typer.echo(comparison.frame().write_csv(), nl=False)
     else:
         print_comparison(comparison)
-    if figure is not None:
-        from khop_env.results.curves import error_over_time
 
-        first = comparison.rows[0].episodes
-        errors = {(row.policy, str(row.observe)): row.episodes.task_error for row in comparison.rows}
-        title = f"{comparison.environment} on {comparison.scenario}: median and middle half of {episodes} episodes"
-        with mistakes(), waiting(f"drawing {figure}"):
-            error_over_time(first.time, errors, figure, title)
-        say(f"figure: {figure}")
+
+def _draw(comparison: Comparison, figure: Path) -> None:
+    from khop_env.results.curves import error_over_time
+
+    first = comparison.rows[0].episodes
+    errors = {(row.policy, str(row.observe)): row.episodes.task_error for row in comparison.rows}
+    title = (
+        f"{comparison.environment} on {comparison.scenario}: median and middle half of {comparison.planned} episodes"
+    )
+    with mistakes(), waiting(f"drawing {figure}"):
+        error_over_time(first.time, errors, figure, title)
+    say(f"figure: {figure}")
 
 
 def split_policies(text: str) -> list[str]:
@@ -103,9 +128,10 @@ def print_comparison(comparison: Comparison) -> None:
         seen = row.summary()
         more, interval = comparison.difference(row)
         settling = seen["settling_time"]
+        count = len(row.episodes.seed)
         rows.append(
             (
-                row.policy,
+                row.policy if count == comparison.planned else f"{row.policy} ({count} episodes)",
                 row.observe,
                 _with_interval(seen["mean_return"], seen["ci95"]),
                 _with_interval(more, interval, sign="+") if number else "",
@@ -127,8 +153,7 @@ def print_comparison(comparison: Comparison) -> None:
         "|e| max",
         "error/bound",
     )
-    count = len(comparison.rows[0].episodes.returns)
-    title = f"{comparison.environment} on {comparison.scenario}, {count} episodes, the same for every row"
+    title = f"{comparison.environment} on {comparison.scenario}, {comparison.planned} episodes, the same for every row"
     print_table(header, rows, title)
     typer.echo(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; error: task\n"

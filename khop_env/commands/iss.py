@@ -8,8 +8,16 @@ from typing import Annotated, Any
 
 import typer
 
-from khop_env.commands.common import JsonOption, ScenarioArgument, folder_name, load, mistakes, print_json
-from khop_env.terminal import Progress, print_table, waiting
+from khop_env.commands.common import (
+    INTERRUPTED,
+    JsonOption,
+    ScenarioArgument,
+    folder_name,
+    load,
+    mistakes,
+    print_json,
+)
+from khop_env.terminal import Progress, print_table, say, waiting
 
 
 def iss(
@@ -22,11 +30,13 @@ def iss(
 ) -> None:
     """Measure Theorem 4: how near to its goal the team comes with errors of a given size, and with tighter bounds.
 
-    Exits with 1 if a run came out farther than the analytical gain allows.
+    Exits with 1 if a run came out farther than the analytical gain allows. Where it is interrupted, what was measured
+    until then is written and printed all the same, but for the figure.
     """
     import polars as pl
 
     from agents.set_iss import analytical_gain, injected_errors, slope, swept_bounds
+    from agents.workers import Interrupted, UnfinishedError
     from khop_env.results.curves import set_iss_figure
 
     with mistakes(name), waiting(f"designing the observers of {name}"):
@@ -36,17 +46,28 @@ def iss(
         gain = analytical_gain(scenario)
         folder = out or Path("runs") / "iss" / folder_name(scenario.name)
         folder.mkdir(parents=True, exist_ok=True)
+    measured: dict[str, list[dict[str, Any]]] = {"injected": [], "swept": []}
+    unfinished: tuple[str, int] | None = None  # why, and the exit status
     with mistakes(name):
-        with Progress("injecting errors") as progress:
-            injected = injected_errors(scenario, episodes=episodes, seed=seed, progress=progress)
-        with Progress("sweeping the bounds") as progress:
-            swept = swept_bounds(scenario, episodes=episodes, seed=seed, progress=progress)
-        files = {key: folder / f"{key}.csv" for key in ("injected", "swept")} | {"figure": folder / "figure.png"}
+        try:
+            with Progress("injecting errors") as progress:
+                measured["injected"] = injected_errors(scenario, episodes=episodes, seed=seed, progress=progress)
+            with Progress("sweeping the bounds") as progress:
+                measured["swept"] = swept_bounds(scenario, episodes=episodes, seed=seed, progress=progress)
+        except (Interrupted, UnfinishedError) as error:
+            unfinished = (str(error), 2) if isinstance(error, UnfinishedError) else ("interrupted", INTERRUPTED)
+            measured["swept" if measured["injected"] else "injected"] = error.partial
+        files = {key: folder / f"{key}.csv" for key, rows in measured.items() if rows}
+        injected, swept = measured.values()
         with waiting(f"writing {folder}"):
-            for key, rows in (("injected", injected), ("swept", swept)):
-                pl.DataFrame(rows, infer_schema_length=None).write_csv(files[key])
-            title = f"{scenario.name}, law {scenario.law.name}: set-ISS with respect to estimation errors (Theorem 4)"
-            set_iss_figure(injected, swept, files["figure"], title)
+            for key, path in files.items():
+                pl.DataFrame(measured[key], infer_schema_length=None).write_csv(path)
+            if unfinished is None:
+                files["figure"] = folder / "figure.png"
+                title = (
+                    f"{scenario.name}, law {scenario.law.name}: set-ISS with respect to estimation errors (Theorem 4)"
+                )
+                set_iss_figure(injected, swept, files["figure"], title)
     slopes = [
         {
             "observers": kind,
@@ -75,7 +96,14 @@ def iss(
                 f"analytical gain: for distances up to {gain.region():.3g} m; it says something of {checked} of "
                 f"{len(injected) + len(swept)} rows, and {verdict}"
             )
-        typer.echo(f"tables: {files['injected']}, {files['swept']}\nfigure: {files['figure']}")
+        if tables := [str(files[key]) for key in ("injected", "swept") if key in files]:
+            typer.echo(f"tables: {', '.join(tables)}")
+        if "figure" in files:
+            typer.echo(f"figure: {files['figure']}")
+    if unfinished is not None:
+        why, status = unfinished
+        say(f"khop: {why}; above is what was measured until then")
+        raise typer.Exit(status)
     if broken:
         raise typer.Exit(1)
 
@@ -91,6 +119,8 @@ def _print_tables(
         ],
         "(a) The law on the truth plus errors, no disturbance: ultimate distance to the goal set",
     )
+    if not swept:  # it was interrupted before
+        return
     typer.echo()
     keys = ("delta", "error", "floor", "distance", "excess", "bound")
     print_table(

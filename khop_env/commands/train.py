@@ -40,7 +40,8 @@ def train(
     """Train a policy; then play it: khop evaluate ENV --policies ppo:FOLDER.
 
     Ctrl-C saves the policy and ends. --resume goes on from the last checkpoint (there are twenty in a run) as if
-    nothing had happened; SAC begins with an empty replay buffer.
+    nothing had happened; SAC begins with an empty replay buffer. With larger --timesteps a run goes on beyond its end;
+    where the scenario was edited, it doesn't.
     """
     with mistakes(), waiting("starting"):
         try:

@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from agents import LAWS, LawError, TanhConsensus, make_law
+from agents import LAWS, LawError, LinearConsensus, TanhConsensus, make_law
 from khop_env.physics import MODELS, AgentModel, velocity_to_input
 from khop_env.scenarios import LawChoice, mixed_fleet, paper
 
@@ -79,6 +79,17 @@ def test_an_unknown_model_is_told_where_to_add_a_controller():
 def test_laws_by_name():
     assert make_law("tanh") == TanhConsensus()
     assert make_law(LawChoice("tanh", {"gain": 3.0})) == TanhConsensus(3.0)
+    assert make_law("tanh:gain=4") == TanhConsensus(4.0)
+    assert make_law("linear:gain=3,cancel_drift=true") == LinearConsensus(3.0, True)
+    for text, said in (
+        ("tanh:gian=4", r"law 'tanh' has no parameter 'gian'; did you mean 'gain'"),
+        ("tanh:gain=fast", r"law 'tanh:gain=fast': gain must be of type float; got 'fast'"),
+        ("tanh:4", r"law 'tanh:4': expected parameter=value after the colon; got '4'"),
+        ("tan:gain=4", r"no law 'tan'; did you mean 'tanh'"),
+        ("tanh:gain=-4", r"gain must be positive and finite; got -4\.0"),
+    ):
+        with pytest.raises(LawError, match=said):
+            make_law(text)
     assert set(LAWS) == {"tanh", "linear", "formation", "leader_following"}
     with pytest.raises(ValueError, match="no law 'tan'; did you mean 'tanh'"):
         make_law("tan")

@@ -1,12 +1,18 @@
 """Evaluation: what is measured, that it is paired, and that nobody who plays makes a difference."""
 
+import gymnasium
 import numpy as np
 import pytest
+import supersuit
+from pettingzoo.utils.conversions import aec_to_parallel
 from scipy import stats
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from agents import compare, evaluate, interval95, make_policy, play
+import khop_env
+from agents import compare, describe, evaluate, interval95, make_policy, play, sb3_policy
 from agents.comparison import CHUNK
-from tests.env.playing import batched, parallel
+from tests.env.playing import aec, batched, joint, parallel
 
 
 def test_an_episode_measured_by_hand():
@@ -14,8 +20,6 @@ def test_an_episode_measured_by_hand():
     env = parallel("formation_v0", "mixed_fleet", max_cycles=40)
     episodes = play(batched("formation_v0", "mixed_fleet", num_envs=4, max_cycles=40), make_policy("linear"), range(7))
     policy = make_policy("linear")
-    from agents import describe
-
     policy.reset(describe(env), seeds=[5])
     seen, infos = env.reset(seed=5)
     errors, total, effort, worst, bound = [], 0.0, [], [], []
@@ -124,8 +128,13 @@ class Stubborn:
         (lambda seen: {}, "policy 'mine' in consensus_v0: no action for 'drifter_0'; got some for nobody"),
         (
             lambda seen: {agent: np.zeros((2, 3)) for agent in seen},
-            r"of 'drifter_0' must have shape \(2, 2\); got \(2, 3\)",
+            r"of 'drifter_0' must have shape \(2, 2\), one row for each copy of the environment; got \(2, 3\)",
         ),
+        (lambda seen: None, r"return actions by agent, {'drifter_0': array of shape \(2, 2\), \.\.\.}; got NoneType"),
+        (lambda seen: [np.zeros((2, 2))] * 8, r"return actions by agent, .*; got list"),
+        (lambda seen: np.zeros((2, 8, 2)), r"return actions by agent, .*; got an array of shape \(2, 8, 2\)"),
+        (lambda seen: dict.fromkeys(seen), "actions of 'drifter_0' aren't numbers: None"),
+        (lambda seen: {agent: [[0.0], [0.0, 1.0]] for agent in seen}, "of 'drifter_0' aren't numbers: .*0.0, 1.0"),
         (
             lambda seen: {agent: np.full((2, 2), np.nan) for agent in seen},
             "action of 'drifter_0' in copy 0 isn't finite",
@@ -137,7 +146,67 @@ def test_actions_that_will_not_do(actions, said):
         evaluate(batched("consensus_v0", num_envs=2), {"mine": Stubborn(actions)}, range(2))
 
 
+def test_lists_of_numbers_are_actions():
+    env = batched("consensus_v0", num_envs=2, max_cycles=5)
+    listed, zero = (
+        evaluate(env, {"zero": policy}, range(2))
+        for policy in (Stubborn(lambda seen: {agent: [[0, 0]] * 2 for agent in seen}), make_policy("zero"))
+    )
+    assert listed.equals(zero)
+
+
+def test_wrapped_environments_are_unwrapped():
+    """What gymnasium.make, env(), PettingZoo's, Gymnasium's, Stable-Baselines3's and SuperSuit's wrappers return."""
+    short, name = {"max_cycles": 5}, "consensus_v0"
+    whole = evaluate(parallel(name, **short), ["tanh"], range(3))
+    vector, rows = khop_env.make_vec(name, num_envs=2, **short), khop_env.make_sb3_vec(name, num_envs=2, **short)
+    for env in (
+        joint("khop/Consensus-v0", **short),
+        gymnasium.make("khop/Consensus-v0", **short),
+        gymnasium.wrappers.FlattenObservation(gymnasium.make("khop/Consensus-v0", **short)),
+        aec(name, **short),
+        aec_to_parallel(aec(name, **short)),
+        supersuit.clip_actions_v0(parallel(name, **short)),
+        supersuit.pettingzoo_env_to_vec_env_v1(parallel(name, **short)),
+        gymnasium.wrappers.vector.ClipReward(vector, -1.0, 1.0),
+        VecNormalize(VecMonitor(rows)),
+    ):
+        assert evaluate(env, ["tanh"], range(3)).equals(whole), env
+        assert describe(env).agents == describe(vector).agents
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_a_model_of_stable_baselines_plays(normalised):
+    """Its actions are those that predict() gives for the rows that it was trained on."""
+    rows = khop_env.make_sb3_vec("formation_v0", num_envs=3, scenario="mixed_fleet", max_cycles=6)
+    env = VecNormalize(rows) if normalised else rows
+    model = PPO("MlpPolicy", env, n_steps=4, batch_size=36, n_epochs=1, seed=0, device="cpu").learn(200)
+    found = play(rows, sb3_policy(model), [3, 4, 5])
+    rows.seed(3)
+    seen = rows.reset()
+    for _ in range(6):
+        given = env.normalize_obs(seen) if normalised else seen
+        actions, _ = model.predict(given, deterministic=True)
+        seen, _, _, _ = rows.step(actions)
+    assert not np.array_equal(found.returns[0], found.returns[1])
+    np.testing.assert_array_equal(found.task_error[-1], model.env.unwrapped.infos["task_error"].mean(axis=1))
+    with pytest.raises(ValueError, match=r"takes observations of shape \(\d+,\) .* those of 'drifter_0' are"):
+        play(batched("consensus_v0", num_envs=1), sb3_policy(model), [0])
+    with pytest.raises(TypeError, match=r"policy 'mine' is of type PPO: agents\.sb3_policy makes a policy of"):
+        evaluate(rows, {"mine": model}, [0])
+    with pytest.raises(TypeError, match="expected a Stable-Baselines3 model, which has predict"):
+        sb3_policy(make_policy("tanh"))
+
+
 def test_mistakes():
+    with pytest.raises(TypeError, match=r"policies are a list of names or a mapping.*; got 'tanh'"):
+        evaluate(batched("consensus_v0", num_envs=1), "tanh", [0])
+    with pytest.raises(ValueError, match=r"policies is a list of names, e\.g\. \['tanh'\]"):
+        compare("consensus_v0", "tanh")
+    with pytest.raises(TypeError, match="policy 'mine' is the class Stubborn: give an object of it"):
+        evaluate(batched("consensus_v0", num_envs=1), {"mine": Stubborn}, [0])
+    with pytest.raises(TypeError, match=r"policy 'mine' is of type str: a policy has reset\(env, seeds\)"):
+        evaluate(batched("consensus_v0", num_envs=1), {"mine": "tanh"}, [0])
     with pytest.raises(ValueError, match="nothing to play without seeds"):
         compare("consensus_v0", ["tanh"], seeds=[])
     with pytest.raises(ValueError, match="no environment 'consensus'; did you mean 'consensus_v0'"):
@@ -150,5 +219,5 @@ def test_mistakes():
         compare("consensus_v0", ["tanh"], ())
     with pytest.raises(ValueError, match="no policy 'than'"):
         compare("consensus_v0", ["tanh", "than"])
-    with pytest.raises(TypeError, match="expected an environment of khop_env; got int"):
+    with pytest.raises(TypeError, match=r"expected an environment of khop_env, e\.g\. .*; got int"):
         evaluate(3, ["tanh"], [0])

@@ -20,15 +20,16 @@ from agents.learning.environment import training_environment
 from agents.learning.networks import make_model
 from agents.policy import by_agent
 from khop_env.cli import app
+from khop_env.env import ObservationLayout
 from tests.agents.training import SMALL
-from tests.env.playing import batched
+from tests.env.playing import batched, same
 
 
 def test_the_last_observation_is_scaled_like_the_others():
     env = training_environment(dataclasses.replace(SMALL, num_envs=4))
     env.reset()
     inner = env.venv.venv
-    scaler = ObservationScaler.of(inner.batched.layouts, 0.05, rates=True)
+    scaler = ObservationScaler.of(describe(inner.batched), rates=True)
     assert np.unique(inner.batched.get_state().cycles).size == 4  # staggered
     for _ in range(60):
         _, _, dones, infos = env.step(np.zeros((env.num_envs, env.action_space.shape[0]), np.float32))
@@ -43,7 +44,7 @@ def test_agents_with_a_heading_see_others_in_their_own_frame():
     """Turned by their heading; integrators and carts as they stand."""
     env = batched("formation_v0", "mixed_fleet", num_envs=3)
     observations, _ = env.reset(0)
-    features = ObservationScaler.of(env.layouts, 0.05, rates=True)(observations, observations)
+    features = ObservationScaler.of(describe(env), rates=True)(observations, observations)
     for number, layout in enumerate(env.layouts):
         seen, found = observations[:, number], features[:, number]
         cos, sin = 1.0, 0.0
@@ -57,6 +58,28 @@ def test_agents_with_a_heading_see_others_in_their_own_frame():
         np.testing.assert_allclose(found[:, :2], 0.5 * seen[:, :2], atol=1e-6)
 
 
+@pytest.mark.parametrize("path", sorted(PRETRAINED.glob("*.npz")), ids=lambda path: path.stem)
+def test_scales_are_found_by_name(path):
+    """Those of the shipped policies, bit for bit; and columns in another order give the same features."""
+    policy = LearnedPolicy.load(path)
+    env = batched(policy.environment, policy.about["scenario"], num_envs=2)
+    description = describe(env)
+    scaler = ObservationScaler.of(description, policy.about["rates"])
+    assert same(scaler, policy.scaler)
+    order = np.random.default_rng(0).permutation(len(scaler.scale))
+    mixed = {
+        agent: ObservationLayout(agent, [layout.fields[q] for q in order], layout.slots)
+        for agent, layout in description.layouts.items()
+    }
+    other = ObservationScaler.of(dataclasses.replace(description, layouts=mixed), policy.about["rates"])
+    before, _ = env.reset(0)
+    after, *_ = env.step(np.ones((2, len(env.agents), policy.action_size)))
+    found, expected = other(after[..., order], before[..., order]), scaler(after, before)
+    count, places = len(order), [scaler.moving.tolist().index(order[column]) for column in other.moving]
+    np.testing.assert_array_equal(found[..., :count], expected[..., order])
+    np.testing.assert_array_equal(found[..., count:], expected[..., count:][..., places])
+
+
 @pytest.mark.parametrize(
     "changes", [{}, {"per_type": True}, {"algorithm": "sac", "batch_size": 64}], ids=["ppo", "per_type", "sac"]
 )
@@ -65,14 +88,14 @@ def test_the_saved_policy_acts_like_the_model(changes, tmp_path):
     config = dataclasses.replace(SMALL, timesteps=2_000, num_envs=4, evaluations=1, **changes)
     from agents.learning.training import _Run
 
-    run = _Run(config, None, False, None)
+    run = _Run(config, None, None, None)
     policy = run.learn().policy
     last = run._exported()
     last.save(tmp_path / "policy.npz")
     loaded = LearnedPolicy.load(tmp_path / "policy.npz")
     env = batched("consensus_v0", "mixed_fleet", num_envs=5)
     observations, _ = env.reset(0)
-    scaler = ObservationScaler.of(env.layouts, 0.05, rates=True)
+    scaler = ObservationScaler.of(describe(env), rates=True)
     loaded.reset(describe(env), range(5))
     before = None
     for _ in range(3):
@@ -105,7 +128,7 @@ def test_padded_slots_do_not_matter():
     """Whatever stands in a slot that isn't valid, the scaled observation and so the action stay the same."""
     env = batched("consensus_v0", "mixed_fleet", num_envs=2)
     observations, _ = env.reset(0)
-    scaler = ObservationScaler.of(env.layouts, 0.05, rates=True)
+    scaler = ObservationScaler.of(describe(env), rates=True)
     rng, checked = np.random.default_rng(0), 0
     for number, layout in enumerate(env.layouts):
         spoilt = observations[:, number].copy()

@@ -18,7 +18,8 @@ from agents.learning import (
 )
 from agents.learning.environment import training_environment
 from agents.learning.networks import make_model
-from agents.learning.training import CHECKPOINT, train
+from agents.learning.run_folder import CHECKPOINT
+from agents.learning.training import train
 from tests.agents.training import SMALL
 from tests.env.playing import batched
 

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 import agents
-from agents import LAWS, LawPolicy, make_law, play, tune
+from agents import LAWS, LawPolicy, describe, make_law, play, tune
+from agents.tuned import tuned_parameters
+from khop_env import consensus_v0
+from khop_env.env import Settings
+from khop_env.registry import scenario as by_name
 from khop_env.scenarios import LawChoice
 from tests.env.playing import EVERY, batched
 
@@ -27,6 +31,7 @@ def test_the_search_ends_near_the_best_of_a_grid():
 
 def test_every_shipped_parameter_set_makes_a_law():
     table = tomllib.loads((Path(agents.__file__).parent / "tuned.toml").read_text())
+    assert table.pop("control_period") == Settings.control_period
     found = {(environment, scenario.partition(":")[0]) for environment, laws in table.items() for scenario in laws}
     assert found == {(environment, scenario.partition(":")[0]) for environment, scenario in EVERY}
     for scenarios in table.values():
@@ -48,3 +53,33 @@ def test_shipped_parameters_are_better_than_the_defaults(environment, scenario):
             play(env, LawPolicy(law), range(32)).returns.mean()
             > 1.01 * play(env, LawPolicy(law, default), range(32)).returns.mean()
         )
+
+
+@pytest.mark.parametrize(("environment", "scenario"), EVERY)
+@pytest.mark.parametrize("law", LAWS)
+def test_parameters_hold_at_longer_control_periods(environment, scenario, law):
+    """What was tuned at 0.05 s is used there as it stands, and costs no multiple of it at 0.2 s."""
+    returns, gains = {}, {}
+    for period in (0.02, 0.05, 0.2):
+        env = batched(environment, scenario, num_envs=8, control_period=period, max_cycles=round(6.0 / period))
+        policy = LawPolicy(law)
+        returns[period], gains[period] = play(env, policy, range(8)).returns.mean(), policy.law.gain
+        tuned = tuned_parameters(describe(env), law)["gain"]
+        assert gains[period] == tuned if period <= 0.05 else gains[period] <= tuned
+        chosen = LawPolicy(law, {"gain": tuned})
+        play(env, chosen, range(8))
+        assert chosen.law.gain == tuned  # a gain that somebody asked for is never changed
+    # the goal moves, or two more periods of 0.2 s pass before agents act on what they see
+    worst = {"consensus_v0": 8.0, "formation_v0": 6.0, "leader_following_v0": 25.0}[environment]
+    assert returns[0.2] > worst * returns[0.05] - 0.1
+
+
+def test_a_default_gain_is_lowered_on_long_periods():
+    """Scenarios that nothing was tuned for, too: 1 / (edges x period) for laws that add up edges."""
+    env = consensus_v0.batched_env(by_name("paper").replace(name="mine"), control_period=0.4)
+    most = max(sum(slot.task_edge for slot in layout.slots) for layout in env.layouts)
+    assert most > 1
+    for law, expected in (("tanh", 1.0 / (most * 0.4)), ("leader_following", 1.0 / 0.4)):
+        policy = LawPolicy(law)
+        policy.reset(describe(env), [0])
+        assert policy.law.gain == expected < make_law(law).gain

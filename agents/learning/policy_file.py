@@ -1,0 +1,141 @@
+"""A learned policy as a file: what `khop train` writes, and what is checked of a file that comes from anybody."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.learning.archive import ArchiveError, read_arrays, write_arrays
+from agents.learning.config import ALGORITHMS
+from agents.learning.scaling import ObservationScaler
+from khop_env.env.layout import Float32Array
+
+FORMAT = 1
+MOST_BYTES = 2**28  # of a policy's arrays; the shipped ones have less than a thousandth of it
+_INDICES = ("valid", "moving", "headed", "heading", "planar")
+_ABOUT = {"algorithm": str, "environment": str, "scenario": str, "bounds": bool}
+
+Layers = tuple[tuple[Float32Array, Float32Array], ...]
+"""(weight (out, in), bias (out,)) of each layer; ReLU between them."""
+
+
+class PolicyFileError(ValueError):
+    """A policy that can't be read, or doesn't fit; the message says which file and what is wrong."""
+
+
+def write_policy(path: Path, fields: Mapping[str, Any]) -> None:
+    """Write a policy into one .npz file.
+
+    Args:
+        path: the file.
+        fields: of `LearnedPolicy`, by name.
+    """
+    networks: Mapping[str, Layers] = fields["networks"]
+    meta = {
+        "format": FORMAT,
+        "environment": fields["environment"],
+        "columns": list(fields["columns"]),
+        "action_size": fields["action_size"],
+        "squash": fields["squash"],
+        "types": list(networks),
+        "layers": {kind: len(layers) for kind, layers in networks.items()},
+        "about": dict(fields["about"]),
+    }
+    scaler: ObservationScaler = fields["scaler"]
+    arrays: dict[str, Any] = {name: getattr(scaler, name) for name in ("scale", "rate", *_INDICES)}
+    for kind, layers in networks.items():
+        for number, (weight, bias) in enumerate(layers):
+            arrays[f"{kind}/{number}/weight"], arrays[f"{kind}/{number}/bias"] = weight, bias
+    write_arrays(path, {"meta": np.array(json.dumps(meta)), **arrays}, compress=True)
+
+
+def read_policy(path: Path) -> dict[str, Any]:
+    """The fields of `LearnedPolicy` from a file, all of them checked.
+
+    Raises:
+        PolicyFileError: for a file that `write_policy` didn't write.
+    """
+    try:
+        return _fields(read_arrays(path, MOST_BYTES))
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        why = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise PolicyFileError(f"{path} isn't a policy that khop train wrote ({why})") from error
+
+
+def _fields(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    stored = arrays["meta"]
+    _require(stored.shape == () and stored.dtype.kind == "U", "meta isn't a text")
+    meta = json.loads(str(stored))
+    _require(isinstance(meta, dict), "meta isn't a JSON object")
+    if meta["format"] != FORMAT:
+        raise ArchiveError(f"its format is {meta['format']!r:.40}, this version reads {FORMAT}")
+    for name, kind in {"environment": str, "columns": list, "action_size": int, "squash": bool}.items():
+        _require(type(meta[name]) is kind, f"{name} isn't of type {kind.__name__}")
+    columns, about, counts = meta["columns"], meta["about"], meta["layers"]
+    _require(bool(columns) and all(isinstance(name, str) for name in columns), "columns aren't names")
+    _require(meta["action_size"] > 0, "action_size isn't positive")
+    for name, kind in _ABOUT.items():
+        _require(isinstance(about, dict) and type(about.get(name)) is kind, f"about has no {name}")
+    _require(about["algorithm"] in ALGORITHMS, f"the algorithm is {about['algorithm']!r:.40}")
+    _require(isinstance(counts, dict) and bool(counts), "it has no networks")
+    _require(all(type(count) is int and 0 < count <= 100 for count in counts.values()), "numbers of layers are wrong")
+    scaler = _scaler(arrays, len(columns))
+    networks = {kind: _layers(arrays, kind, count, scaler.size, meta["action_size"]) for kind, count in counts.items()}
+    return {
+        "environment": meta["environment"],
+        "columns": tuple(columns),
+        "action_size": meta["action_size"],
+        "squash": meta["squash"],
+        "networks": networks,
+        "scaler": scaler,
+        "about": about,
+    }
+
+
+def _scaler(arrays: Mapping[str, np.ndarray], columns: int) -> ObservationScaler:
+    """The scaler, whose index arrays stay within what they index."""
+    scale, rate = _numbers(arrays, "scale", (columns,)), arrays["rate"]
+    _require(rate.shape == () and rate.dtype.kind in "fi" and 0.0 < float(rate) < math.inf, "rate isn't positive")
+    moving = len(arrays["moving"]) if arrays["moving"].ndim else 0
+    limits = {"valid": columns + 1, "planar": columns + moving}
+    found = {}
+    for name in _INDICES:
+        index, limit = arrays[name], limits.get(name, columns)
+        _require(index.dtype == np.int64 and index.ndim == (2 if name == "planar" else 1), f"{name} isn't an index")
+        _require(bool(np.all((index >= 0) & (index < limit))), f"{name} is out of range")
+        found[name] = index
+    headed, planar = len(found["headed"]), found["planar"]
+    _require(len(found["valid"]) == columns, "valid is of another length")
+    _require(len(found["heading"]) == (2 if headed else 0), "heading isn't a pair of columns")
+    _require(planar.shape[1] == 2 and (headed > 0 or not len(planar)), "planar doesn't hold pairs")
+    return ObservationScaler(scale=scale, rate=float(rate), **found)
+
+
+def _layers(arrays: Mapping[str, np.ndarray], kind: str, count: int, inputs: int, outputs: int) -> Layers:
+    """The layers of a network, each of which takes what the one before gives."""
+    layers, width = [], inputs
+    for number in range(count):
+        name = f"{kind}/{number}"
+        size = outputs if number == count - 1 else len(np.atleast_1d(arrays[f"{name}/bias"]))
+        weight = _numbers(arrays, f"{name}/weight", (size, width))
+        layers.append((weight, _numbers(arrays, f"{name}/bias", (size,))))
+        width = size
+    return tuple(layers)
+
+
+def _numbers(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> Float32Array:
+    array = arrays[name]
+    _require(array.dtype == np.float32, f"{name} has {array.dtype} for float32")
+    _require(array.shape == shape, f"{name} has shape {array.shape} for {shape}")
+    _require(bool(np.isfinite(array).all()), f"{name} isn't finite")
+    return array
+
+
+def _require(condition: bool, wrong: str) -> None:
+    if not condition:
+        raise ArchiveError(wrong)

@@ -1,0 +1,218 @@
+"""Policy files that come from anybody: good ones are read, and all others refused by name."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from agents import describe, make_policy, play
+from agents.learning import PRETRAINED, LearnedPolicy, PolicyFileError
+from agents.learning.archive import ArchiveError, read_arrays, write_arrays
+from khop_env.registry import make_batched
+from tests.env.playing import batched
+
+GOOD = PRETRAINED / "leader_following_v0@mixed_fleet.npz"  # with headings, so that every index array is used
+MUTATIONS = 300
+
+
+def contents():
+    return read_arrays(GOOD, 2**24)
+
+
+def change_meta(arrays, rng):
+    meta = json.loads(str(arrays["meta"]))
+    inner = meta if rng.random() < 0.6 else rng.choice([meta["about"], meta["layers"]])
+    key = rng.choice(list(inner))
+    values = [None, -1, 0, 10**30, 1.5, "text", [], {}, [1], {"": 1e300}, True, "consensus_v0", ["a"] * 5]
+    if rng.random() < 0.3:
+        del inner[key]
+    else:
+        inner[key] = values[rng.integers(len(values))]
+    arrays["meta"] = np.array(json.dumps(meta))
+
+
+def change_array(arrays, rng):
+    name = rng.choice(list(arrays))
+    array = arrays[name]
+    changes = [
+        lambda: array.astype(str),
+        lambda: array.astype("complex128") if array.dtype.kind in "if" else np.array([]),
+        lambda: array[..., None],
+        lambda: array.reshape(-1)[: array.size // 2],
+        lambda: np.full(array.shape, np.nan, np.float32),
+        lambda: np.full(array.shape, np.inf),
+        lambda: array + 10**6 if array.dtype.kind in "if" else array,
+        lambda: -array - 7 if array.dtype.kind in "if" else array,
+        lambda: array.astype(np.float64) if array.dtype.kind in "if" else array,
+        lambda: np.zeros((0, 3)),
+        lambda: np.zeros(3, [("a", "f4")]),
+    ]
+    arrays[name] = changes[rng.integers(len(changes))]()
+
+
+def rename(arrays, rng):
+    name = rng.choice(list(arrays))
+    arrays[str(rng.choice(["", "meta", "0/0/weight", "../meta", name + "x"]))] = arrays.pop(name)
+
+
+def damaged(content, rng):
+    """Bytes flipped, cut out, put in, or the end missing."""
+    spoilt, kind = bytearray(content), rng.integers(4)
+    place = int(rng.integers(len(spoilt)))
+    if kind == 0:
+        for at in rng.integers(len(spoilt), size=rng.integers(1, 20)):
+            spoilt[at] = rng.integers(256)
+    elif kind == 1:
+        del spoilt[place:]
+    elif kind == 2:
+        del spoilt[place : place + int(rng.integers(1, 100))]
+    else:
+        spoilt[place:place] = rng.bytes(int(rng.integers(1, 100)))
+    return bytes(spoilt)
+
+
+def mutated(rng):
+    arrays = contents()
+    kind = rng.integers(5)
+    if kind == 0:
+        return damaged(GOOD.read_bytes(), rng)
+    for _ in range(rng.integers(1, 3)):
+        [change_meta, change_array, rename, lambda arrays, rng: arrays.pop(rng.choice(list(arrays)))][kind - 1](
+            arrays, rng
+        )
+    stream = io.BytesIO()
+    (np.savez if rng.random() < 0.5 else np.savez_compressed)(stream, **arrays)
+    return stream.getvalue()
+
+
+def test_every_mutation_is_refused_by_name_or_acts(tmp_path):
+    """Nothing else than a policy whose actions are in [-1, 1], or a PolicyFileError that names the file."""
+    rng, refused = np.random.default_rng(0), []
+    env = batched("leader_following_v0", "mixed_fleet", num_envs=1)
+    observations = dict(zip(env.agents, env.reset(0)[0].swapaxes(0, 1), strict=True))
+    for number in range(MUTATIONS):
+        path = tmp_path / f"{number}.npz"
+        path.write_bytes(mutated(rng))
+        try:
+            policy = LearnedPolicy.load(path)
+        except PolicyFileError as error:
+            refused.append((path, str(error)))
+            continue
+        try:
+            policy.reset(describe(env), [0])
+        except PolicyFileError:
+            continue
+        for action in policy.act(observations).values():
+            assert np.all(np.abs(action) <= 1.0)
+    assert len(refused) > 0.7 * MUTATIONS
+    assert all(str(path) in said and len(said) < 500 + len(str(path)) for path, said in refused)
+
+
+def with_member(name, content):
+    """The good file with another member, as bytes."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(GOOD) as old, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as new:
+        for one in old.infolist():
+            new.writestr(one.filename, content if one.filename == name else old.read(one))
+        if name not in old.namelist():
+            new.writestr(name, content)
+    return stream.getvalue()
+
+
+def npy(array, **options):
+    stream = io.BytesIO()
+    np.save(stream, array, **options)
+    return stream.getvalue()
+
+
+class Payload:
+    """What a pickle runs when it is read."""
+
+    def __reduce__(self):
+        return pytest.fail, ("a pickle was read",)
+
+
+HUGE = npy(np.zeros(1)).replace(b"(1,), }" + b" " * 10, b"(99999999999,), }")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "it is empty"),
+        (npy(np.zeros(3)), "File is not a zip file"),
+        (GOOD.read_bytes()[:-30], "File is not a zip file"),
+        (with_member("scale.npy", npy(np.array([Payload()]), allow_pickle=True)), "arrays of object"),
+        (with_member("scale.npy", HUGE), r"header says shape \(99999999999,\)"),
+        (with_member("scale.npy", b"\x93NUMPY\x01\x00\x10\x27" + b"(" * 10000), "."),
+        (with_member("meta.npy", npy(np.array('{"format": ' + "[" * 100_000))), "."),
+        (with_member("planar.npy", npy(np.full((2, 2), 10**9))), "planar is out of range"),
+        (with_member("moving.npy", npy(np.array([-1]))), "moving is out of range"),
+        (with_member("rate.npy", npy(np.array(0.0))), "rate isn't positive"),
+        (with_member("/0/bias.npy", npy(np.full(64, np.nan, np.float32))), "/0/bias isn't finite"),
+        (with_member("/0/bias.npy", npy(np.full(64, "1.0"))), "/0/bias has <U3 for float32"),
+    ],
+    ids=range(12),
+)
+def test_crafted_files_are_refused(tmp_path, content, said):
+    path = tmp_path / "crafted.npz"
+    path.write_bytes(content)
+    with pytest.raises(PolicyFileError, match=rf"crafted.npz isn't a policy that khop train wrote \(.*{said}"):
+        make_policy(f"ppo:{path}")
+
+
+def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    """By the size that it declares; and what declares less than it holds yields no more than it declares."""
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("scale.npy", "w") as member:
+        for _ in range(300):
+            member.write(bytes(2**20))
+    assert path.stat().st_size < 2**20
+    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("it was unpacked"))
+    with pytest.raises(PolicyFileError, match="unpacked it would have 314,572,800 bytes, and at most 268,435,456"):
+        make_policy(f"ppo:{path}")
+    monkeypatch.undo()
+    path.write_bytes(path.read_bytes().replace((300 * 2**20).to_bytes(4, "little"), (1000).to_bytes(4, "little")))
+    with pytest.raises(PolicyFileError, match=r"bomb\.npz isn't a policy"):
+        make_policy(f"ppo:{path}")
+
+
+def test_archives_come_back_as_they_were(tmp_path):
+    """Bit for bit, with and without compression, and nothing but plain arrays."""
+    arrays = {"a": np.array([np.nan, -0.0]), "b": np.array("text"), "c": np.zeros((0, 3), np.int64)}
+    for compress in (True, False):
+        write_arrays(tmp_path / "new" / "x.npz", arrays, compress=compress)
+        found = read_arrays(tmp_path / "new" / "x.npz", 10_000)
+        assert {name: (one.dtype, one.shape, one.tobytes()) for name, one in found.items()} == {
+            name: (one.dtype, one.shape, one.tobytes()) for name, one in arrays.items()
+        }
+        assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.npz"]
+    with pytest.raises(ArchiveError, match="isn't a regular file"):
+        read_arrays(tmp_path, 10_000)
+
+
+def test_the_choice_between_several_shipped_policies_is_named(tmp_path, monkeypatch):
+    """One for the scenario is taken; of several one has to be named; and the order of files says nothing."""
+    from agents.running import policy_run
+    from khop_env.registry import scenario
+
+    policy = make_policy("ppo:pretrained")
+    assert policy.about_for("convoy")["environment"] == "leader_following_v0"
+    for name in ("leader_following_v0@convoy", "consensus_v0@convoy"):
+        (tmp_path / f"{name}.npz").write_bytes((PRETRAINED / "leader_following_v0@convoy.npz").read_bytes())
+    monkeypatch.setattr("agents.learning.learned.PRETRAINED", tmp_path)
+    both = "2 pretrained policies for convoy: choose ppo:pretrained/consensus_v0 or ppo:pretrained/leader_following_v0"
+    with pytest.raises(PolicyFileError, match=both):
+        policy_run("ppo:pretrained", scenario("convoy"), "estimate", 1.0, 0)
+    run = policy_run("ppo:pretrained/leader_following_v0", scenario("convoy"), "estimate", 1.0, 0)
+    assert run.env.batched.task.name == "leader_following"
+    with pytest.raises(
+        PolicyFileError, match="no pretrained policy for formation_v0 on convoy; there are: consensus_v0 "
+    ):
+        make_policy("ppo:pretrained/formation_v0").about_for("convoy")
+    with pytest.raises(ValueError, match="no environment 'consensus'; did you mean 'consensus_v0'"):
+        make_policy("ppo:pretrained/consensus")
+    env = make_batched("consensus_v0", "convoy")
+    with pytest.raises(ValueError, match="the policy for leader_following_v0 was asked for, and this is consensus_v0"):
+        play(env, make_policy("ppo:pretrained/leader_following_v0"), [0])

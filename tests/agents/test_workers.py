@@ -1,0 +1,243 @@
+"""Several processes: they end with the caller, their death is noticed, and what was done until then is kept."""
+
+import contextlib
+import io
+import json
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from agents import compare, tune
+from agents.set_iss import injected_errors, swept_bounds
+from agents.workers import Interrupted, UnfinishedError, WorkerError, run_in_processes
+from khop_env.cli import app
+from khop_env.registry import scenario
+from khop_env.scenarios.export import write_scenario
+from tests.env.playing import batched
+
+ROOT = Path(__file__).parents[2]
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    stat = Path(f"/proc/{pid}/stat")
+    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def doing(task):
+    """What a worker does in these tests."""
+    what, value = task
+    if what == "wait":
+        time.sleep(600)
+    if what == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if what == "leave":
+        os._exit(value)
+    if what == "fail":
+        raise ValueError(f"no {value}")
+    return os.getpid()
+
+
+def test_every_task_is_done_once():
+    found = dict(run_in_processes(doing, [("pid", q) for q in range(20)], 2))
+    assert sorted(found) == list(range(20))
+    assert len(set(found.values()) - {os.getpid()}) == 2
+    assert not any(alive(pid) for pid in found.values())
+    with pytest.raises(ValueError, match="no luck"):
+        list(run_in_processes(doing, [("fail", "luck"), ("wait", 0)], 2))
+    with pytest.raises(ValueError, match="can't be sent to other processes, take one worker"):
+        list(run_in_processes(lambda task: task, [1], 2))
+
+
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [
+        (("die", 0), "a worker process was killed by SIGKILL"),
+        (("leave", 3), r"a worker process ended with status 3 \(a script"),
+    ],
+)
+def test_a_killed_worker_is_noticed(task, said):
+    results = []
+    with pytest.raises(WorkerError, match=said):
+        results.extend(result for result in run_in_processes(doing, [("pid", 0), ("pid", 1), task, ("wait", 0)], 2))
+    assert len(results) <= 2
+
+
+def test_workers_end_where_nobody_waits_for_them():
+    results = run_in_processes(doing, [("pid", 0), ("pid", 1), ("wait", 0), ("wait", 0)], 2)
+    pids = {pid for _, (_, pid) in zip(range(2), results, strict=False)}
+    assert all(alive(pid) for pid in pids)
+    results.close()
+    assert not any(alive(pid) for pid in pids)
+
+
+def test_comparisons_in_threads_are_those_of_one_thread():
+    """Each has environments of its own."""
+    calls = [{"policies": [law], "seeds": range(12), "observe": [mode]} for law in ("tanh", "random", "linear")
+             for mode in ("estimate", "local")]  # fmt: skip
+    alone = [compare("consensus_v0", **call, arguments={"max_cycles": 60}).summary() for call in calls]
+    with ThreadPoolExecutor(6) as threads:
+        found = list(threads.map(lambda call: compare("consensus_v0", **call, arguments={"max_cycles": 60}), calls))
+    assert [one.summary() for one in found] == alone
+
+
+def test_an_edited_scenario_file_is_read_again(tmp_path):
+    path, found = tmp_path / "mine.toml", []
+    for radius in (1.0, 0.25):
+        chosen = scenario("paper")
+        chosen = chosen.replace(name="mine", radius=radius * chosen.radius)
+        path.write_text(write_scenario(chosen))
+        asked = {"policies": ["zero"], "seeds": range(2), "arguments": {"max_cycles": 3}}
+        found.append(compare("consensus_v0", scenario=path, **asked).summary())
+        assert found[-1] == compare("consensus_v0", scenario=chosen, **asked).summary()
+    assert found[0]["rows"] != found[1]["rows"]
+
+
+def interrupting(after):
+    """A progress that presses Ctrl-C at its n-th call."""
+    calls = []
+
+    def progress(_):
+        calls.append(0)
+        if len(calls) == after:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_what_was_played_is_kept():
+    """Rows that are finished, and of others the first episodes; equal to those of a whole comparison."""
+    call = {"policies": ["tanh", "zero"], "observe": ["local"], "seeds": range(60), "arguments": {"max_cycles": 4}}
+    whole = compare("consensus_v0", **call)
+    with pytest.raises(Interrupted) as caught:
+        compare("consensus_v0", **call, progress=interrupting(5))
+    partial = caught.value.partial
+    assert [len(row.episodes.seed) for row in partial.rows] == [60, 50]
+    assert [row.get("episodes") for row in partial.summary()["rows"]] == [None, 50]
+    assert partial.rows[0].summary() == whole.rows[0].summary()
+    assert (
+        partial.frame()
+        .filter(pl.col("policy") == "zero")
+        .equals(whole.frame().filter(pl.col("policy") == "zero", pl.col("seed") < 50))
+    )
+    more = whole.rows[1].episodes.returns[:50] - whole.rows[0].episodes.returns[:50]
+    assert partial.difference(partial.rows[1])[0] == more.mean()
+    assert isinstance(caught.value, KeyboardInterrupt)
+
+
+def test_tuning_and_measuring_keep_what_they_found():
+    env = batched("consensus_v0", "paper", num_envs=4, max_cycles=40)
+    with pytest.raises(Interrupted) as caught:
+        tune(env, "leader_following", range(4), progress=interrupting(1))
+    assert caught.value.partial.mean_return > caught.value.partial.default_return
+    short = scenario("paper").replace(duration=0.5)
+    rows = injected_errors(short, sizes=(0.1, 0.2), episodes=1)
+    with pytest.raises(Interrupted) as caught:
+        injected_errors(short, sizes=(0.1, 0.2), episodes=1, progress=interrupting(2))
+    assert caught.value.partial == rows[:3]
+    with pytest.raises(Interrupted) as caught:
+        swept_bounds(short, factors=(1.0, 0.5), episodes=1, progress=interrupting(3))
+    assert [row["factor"] for row in caught.value.partial] == [1.0, 0.5, 1.0]
+
+
+COMMAND = """
+import sys
+from khop_env.terminal import Progress
+Progress.__call__ = lambda self, fraction: print(f"at {fraction}", file=sys.stderr, flush=True)
+from khop_env.cli import main
+main()
+"""
+
+
+def children(pid):
+    return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+EVALUATE = ("evaluate", "consensus_v0", "--policies", "zero", "--observe", "estimate", "--episodes", "100000")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "calls", "printed", "said"),
+    [
+        ((*EVALUATE, "--workers", "2", "--json"), 3, '"episodes": ', "interrupted; above is what was played"),
+        ((*EVALUATE, "--csv"), 2, "consensus_v0,paper,estimate,zero,49,", "interrupted; above is what was played"),
+        (("tune", "consensus_v0", "--policies", "leader_following"), 2, "}  # interrupted\n", "was found until then"),
+        (("iss", "paper", "--duration", "3", "--episodes", "2"), 5, "0.02 ", "above is what was measured until then"),
+    ],
+    ids=["workers", "evaluate", "tune", "iss"],
+)
+def test_ctrl_c_on_the_command_line(tmp_path, arguments, calls, printed, said):
+    """As a terminal sends it, to all processes of the group: a table, a line, status 130, and nobody is left."""
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", COMMAND, *arguments],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    progress = iter(process.stderr.readline, "")
+    lines = [next(line for line in progress if line.startswith("at ")) for _ in range(calls)]
+    workers = children(process.pid) if Path("/proc/self/task").exists() else []
+    with contextlib.ExitStack() as stack:
+        stack.callback(process.kill)
+        os.killpg(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=60)
+    assert len(lines) == calls
+    assert process.returncode == 130, stderr
+    assert printed in stdout
+    stderr = "".join(line for line in io.StringIO(stderr) if not line.startswith("at "))
+    assert stderr.endswith(said + (" until then\n" if said.endswith("played") else "\n"))
+    assert "Traceback" not in stderr
+    deadline = time.monotonic() + 10.0  # Python's own resource tracker goes a moment after its parent
+    while any(alive(pid) for pid in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(alive(pid) for pid in workers)
+    assert len(workers) >= (2 if "--workers" in arguments else 0)
+    if "--json" in arguments:
+        assert json.loads(stdout)["rows"][0]["episodes"] % 25 == 0
+
+
+def test_a_killed_worker_on_the_command_line(monkeypatch):
+    """One line, status 2, and what was played."""
+
+    def kill(*_):
+        os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+
+    monkeypatch.setattr("khop_env.commands.evaluate.Progress.__call__", kill)
+    result = CliRunner().invoke(app, [*EVALUATE, "--workers", "2"])
+    assert result.exit_code == 2
+    assert result.stderr == (
+        "khop: a worker process was killed by SIGKILL (where memory is short, use fewer); above is what was played "
+        "until then\n"
+    )
+    assert re.search(r"zero \(\d+ episodes\)", result.stdout)
+
+
+def test_a_policy_that_fails_on_the_way(monkeypatch):
+    """Its error is told, and the rows before it are kept."""
+    played = []
+
+    def play(env, policy, seeds, *, name):
+        if len(played) == 2:
+            raise ValueError(f"policy {name!r} stumbled")
+        played.append(seeds)
+        from agents.evaluation import play as real
+
+        return real(env, policy, seeds, name=name)
+
+    monkeypatch.setattr("agents.comparison.play", play)
+    with pytest.raises(UnfinishedError, match="policy 'zero' stumbled") as caught:
+        compare("consensus_v0", ["tanh", "zero"], ["local", "oracle"], seeds=range(2), arguments={"max_cycles": 2})
+    assert [row.label for row in caught.value.partial.rows] == ["tanh on local", "tanh on oracle"]
+    monkeypatch.undo()
