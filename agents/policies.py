@@ -70,7 +70,7 @@ def _policy_of_your_own(spec: str) -> Policy:
     policy = found() if isinstance(found, type) else found
     if not (callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None))):
         raise ValueError(
-            f"policy {spec!r}: a policy has reset(env, seeds) and act(observations); got {type(policy).__name__} without"
+            f"policy {spec!r}: a policy has reset(env, seeds) and act(observations); got {type(policy).__name__}"
         )
     checked: Policy = policy
     return checked

@@ -1,0 +1,109 @@
+"""A task of a user's own works wherever a built-in one does, without a line of the library."""
+
+import functools
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+import khop_env
+from agents import evaluate, make_policy
+from agents.comparison import compare
+from agents.learning import TrainingConfig
+from agents.learning.training import train
+from khop_env.registry import make_aec, make_batched, make_joint
+from khop_env.testing import check_environment
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "06_your_own_task.py"
+OWN = runpy.run_path(str(EXAMPLE))
+KeepApart, GoToGoal = OWN["KeepApart"], OWN["GoToGoal"]
+NAME = f"{EXAMPLE}:KeepApart"
+
+
+def test_no_file_of_the_library_knows_it():
+    """The example is the one file that the task touches."""
+    library = [*(ROOT / "khop_env").rglob("*.py"), *(ROOT / "agents").rglob("*.py")]
+    touched = [path for path in library if "KeepApart" in (text := path.read_text()) or "keep_apart" in text]
+    assert len(library) > 100
+    assert touched == []
+
+
+@pytest.mark.parametrize("scenario", ["paper", "mixed_fleet"])
+def test_it_keeps_the_contract(scenario):
+    """Spaces, seeds, copies, pickles, vector rows, leaks, and the checks of PettingZoo, Gymnasium and SB3."""
+    report = check_environment(functools.partial(khop_env.make, NAME, scenario, max_cycles=40), steps=60)
+    report.raise_if_failed()
+    assert {check.status for check in report.checks} == {"passed"}
+
+
+def test_observations_rewards_and_infos_are_the_task_s():
+    env = make_batched(KeepApart(radius=0.8, penalty=2.0), "paper", num_envs=3)
+    observations, _ = env.reset(seed=1)
+    observations, reward, terminated, _, infos = env.step(np.zeros((3, 8, 2)))
+    positions, goal = env.world.positions(), env.task.memory["goal"]
+    columns = env.layouts[2].columns("goal")
+    np.testing.assert_allclose(observations[:, 2, columns], (goal[2] - positions[2]).T, atol=1e-6)
+    np.testing.assert_allclose(infos["task_error"], np.linalg.norm(goal - positions, axis=1).T)
+    np.testing.assert_allclose(reward, -0.05 * (infos["task_error"] + 2.0 * infos["too_close"]))
+    assert not terminated.any()
+    assert len({goal[0, 0, b] for b in range(3)}) == 3  # drawn for each episode
+
+
+def test_its_memory_is_saved_and_restored():
+    env = make_batched(KeepApart(), "paper", num_envs=2)
+    env.reset(seed=0)
+    saved = env.get_state()
+    first = env.step(np.zeros((2, 8, 2)))
+    env.reset(seed=5)
+    env.set_state(saved)
+    again = env.step(np.zeros((2, 8, 2)))
+    for ours, theirs in zip(first[:4], again[:4], strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_every_kind_of_environment():
+    """Parallel, AEC, vector, SB3, joint; a frame that shows the goals."""
+    aec = make_aec(KeepApart, "paper")
+    aec.reset(seed=0)
+    assert aec.last()[0].shape == aec.observation_space(aec.agent_selection).shape
+    vec = khop_env.make_vec(KeepApart, num_envs=2, radius=0.3)
+    assert vec.reset(seed=0)[0].shape == (16, vec.single_observation_space.shape[0])
+    assert make_joint(KeepApart).reset(seed=0)[0].ndim == 1
+    sb3 = khop_env.make_sb3_vec(KeepApart, num_envs=2, max_cycles=10)
+    PPO("MlpPolicy", sb3, n_steps=16, batch_size=64, seed=0, device="cpu").learn(256)
+    frames = []
+    for task in (KeepApart, "consensus_v0"):
+        env = khop_env.make(task, "paper", render_mode="rgb_array")
+        env.reset(seed=0)
+        frames.append(env.render())
+    assert (frames[0] != frames[1]).any(axis=-1).sum() > 100
+
+
+def test_evaluation_and_training():
+    """By object, by class and by name; a policy that knows the task beats doing nothing."""
+    env = make_batched(KeepApart(), "paper", num_envs=4, max_cycles=60)
+    frame = evaluate(env, {"own": GoToGoal(), "idle": make_policy("zero")}, seeds=range(4))
+    means = {name: rows["return"].mean() for (name,), rows in frame.group_by("policy")}
+    assert means["own"] > 0.3 * means["idle"]
+    table = compare(NAME, ["zero", f"{EXAMPLE}:GoToGoal"], seeds=range(2), arguments={"max_cycles": 20})
+    assert table.environment == "keep_apart_v0"
+    assert [row.policy for row in table.rows] == ["zero", f"{EXAMPLE}:GoToGoal"]
+    trained = train(TrainingConfig(KeepApart(), timesteps=2000, num_envs=2, evaluations=1))
+    assert trained.policy.environment == "keep_apart_v0"
+    assert np.isfinite(trained.curve[-1].mean_return)
+
+
+def test_mistakes_are_refused():
+    class Uneven(KeepApart):
+        def columns(self, world, agent):
+            return super().columns(world, agent)[: 1 + agent % 2]
+
+    with pytest.raises(ValueError, match=r"task 'uneven': uniform observations need as many columns for every agent"):
+        make_batched(Uneven(), "paper")
+    with pytest.raises(TypeError, match=r"expected an environment's name or a Task; got 3"):
+        make_batched(3)
+    with pytest.raises(TypeError, match=r"got an unexpected keyword argument 'radios'; did you mean 'radius'"):
+        make_batched(KeepApart, radios=1.0)
