@@ -75,10 +75,9 @@ class Scenario:
 
     def __post_init__(self) -> None:
         agents = len(self.models)
-        validate_graph(self.communication, agents)
-        check_task_graph(
-            validate_graph(self.task, agents, name="task graph", connected=False), self.communication, self.k
-        )
+        # copies without attributes: an edge counts once, whatever weight it carries
+        object.__setattr__(self, "communication", validate_graph(self.communication, agents))
+        object.__setattr__(self, "task", check_task_graph(self.task, self.communication, self.k))
         for name in ("center", "radius"):
             values = np.asarray(getattr(self, name), dtype=float)
             if values.shape not in ((), (self.fleet.n,)) or not np.all(np.isfinite(values)):

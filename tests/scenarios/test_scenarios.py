@@ -7,7 +7,8 @@ import pytest
 from agents import make_law
 from khop_env.observers import Exponential
 from khop_env.physics import DriftingIntegrator, Sum, random_geometric_graph
-from khop_env.scenarios import mixed_fleet, paper, random_geometric
+from khop_env.results import design_report
+from khop_env.scenarios import convoy, mixed_fleet, paper, random_geometric
 from khop_env.scenarios.files import write_scenario
 
 
@@ -15,6 +16,11 @@ def spread(simulator):
     """|Pi p| of the positions."""
     p = simulator.fleet.positions(simulator.x)[0]
     return np.linalg.norm(p - p.mean(axis=0))
+
+
+@pytest.mark.parametrize("make", [convoy, mixed_fleet, paper, random_geometric])
+def test_scenarios_are_functions_of_their_package(make):
+    assert make().name.partition(":")[0] == make.__name__
 
 
 def test_paper_has_the_published_numbers():
@@ -50,6 +56,42 @@ def test_estimates_lead_the_team_together_and_keep_their_bounds(factory):
     assert spread(simulator) < 0.25 * before
     for ratio in vars(simulator.extremes).values():
         assert np.all(ratio < 1.0)
+
+
+def test_attributes_of_nodes_and_edges_change_nothing():
+    """Laws and observers count edges; so do Theorem 4's gain and the assumptions."""
+    scenario = paper().replace(disturbance=None)
+    graphs = {name: getattr(scenario, name).copy() for name in ("communication", "task")}
+    for graph in graphs.values():
+        nx.set_edge_attributes(graph, 100.0, "weight")
+        nx.set_node_attributes(graph, 7.0, "weight")
+        graph.graph["name"] = "heavy"
+    heavy = scenario.replace(**graphs)
+    law = make_law(scenario.law)
+    assert law.set_iss_gain(heavy) == law.set_iss_gain(scenario)
+    assert law.set_iss_gain(scenario).coupling == pytest.approx(2.0 * nx.algebraic_connectivity(scenario.task))
+    assert design_report(heavy) == design_report(scenario)
+    for name in graphs:
+        assert not any(attributes for *_, attributes in getattr(heavy, name).edges(data=True))
+        assert not any(attributes for _, attributes in getattr(heavy, name).nodes(data=True))
+
+
+@pytest.mark.parametrize("name", ["communication", "task"])
+def test_graphs_that_say_more_than_an_edge_can_are_refused(name):
+    loop = nx.Graph(getattr(paper(), name))
+    loop.add_edge(3, 3)
+    for graph, message in (
+        (loop, r"own neighbour; remove the self-loops \(3, 3\)"),
+        (nx.MultiGraph(loop), "got a MultiGraph"),
+        (nx.DiGraph(loop), "got a DiGraph"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} graph: .*{message}"):
+            paper().replace(**{name: graph})
+
+
+def test_a_scenarios_graphs_cannot_be_changed_behind_its_design():
+    with pytest.raises(nx.NetworkXError, match="Frozen graph"):
+        paper().task.add_edge(0, 5)
 
 
 def test_mixed_fleet_is_mixed():
