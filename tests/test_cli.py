@@ -187,18 +187,19 @@ class TestRun:
         assert "left the funnel" in found["error"]
 
     def test_a_plant_that_diverges_loses_nothing(self, folder):
-        """Vessels that all hear each other, in steps far too long: the states overflow, and that is told."""
-        lines = 'name = "vessels"\nk = 2\n[[agents]]\nmodel = "vessel"\ncount = 4\n'
+        """Points without limits under a gain far too high for their steps: the states overflow, and that is told."""
+        lines = 'name = "points"\nk = 2\n[[agents]]\nmodel = "integrator"\ncount = 4\ninput_limit = inf\n'
         edges = f"edges = {[list(edge) for edge in itertools.combinations(range(4), 2)]}\n"
         bound = "initial = 10\nfinal = 1\nrate = 5\n"
-        (folder / "vessels.toml").write_text(
-            f"{lines}[communication]\n{edges}[task]\n{edges}[delta]\n{bound}[theta]\n{bound}"
+        law = '[law]\nname = "linear"\ngain = 100\n'
+        (folder / "points.toml").write_text(
+            f"{lines}[communication]\n{edges}[task]\n{edges}[delta]\n{bound}[theta]\n{bound}{law}"
         )
-        arguments = ["run", "vessels.toml", "--dt", "3", "--duration", "60"]
+        arguments = ["run", "points.toml", "--dt", "3", "--duration", "360"]
         result = khop(*arguments, status=1)
         assert "the plant diverged" in result.stdout
         assert "Warning" not in result.stderr
-        assert len(list((folder / "runs" / "vessels").iterdir())) == 4
+        assert len(list((folder / "runs" / "points").iterdir())) == 4
         found = only_json(khop(*arguments, "--json", status=1))
         assert found["funnel_kept"] is False
         assert found["diverged"] is True

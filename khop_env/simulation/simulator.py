@@ -19,6 +19,9 @@ from khop_env.simulation.integrators import Integrator, Proximal
 from khop_env.simulation.state import SimulatorState
 from khop_env.simulation.view import Law, Observe
 
+MOST_PARTS = 10_000
+"""Steps of the integrator that one `Simulator.step` may be divided into."""
+
 
 @dataclass(frozen=True, eq=False)
 class InitialSet:
@@ -27,10 +30,22 @@ class InitialSet:
     Attributes:
         center: (n,) in the states' units.
         radius: (n,) half widths, not negative.
+
+    Raises:
+        ValueError: if they differ in shape, or a number isn't finite or a half width negative.
     """
 
     center: FloatArray
     radius: FloatArray
+
+    def __post_init__(self) -> None:
+        center, radius = np.asarray(self.center, dtype=float), np.asarray(self.radius, dtype=float)
+        if center.ndim != 1 or center.shape != radius.shape or not np.isfinite([center, radius]).all():
+            raise ValueError(f"center and radius must be finite, (n,) each; got {self.center!r} and {self.radius!r}")
+        if (radius < 0.0).any():
+            raise ValueError(f"radius must not be negative; got {radius.min():g} for component {radius.argmin()}")
+        object.__setattr__(self, "center", center)
+        object.__setattr__(self, "radius", radius)
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """One (n,) initial state."""
@@ -99,6 +114,10 @@ class Simulator:
         sizes = design.states.layout.size, design.inputs.layout.size
         self._state = SimulatorState.zeros(batch, self.fleet.n, self.fleet.m, *sizes, draws)
         self.integrator.prepare(self._loop)
+        reach, pushed = np.abs(initial.center) + initial.radius, np.zeros(self.fleet.n)
+        self._longest_step, self._stiffest = self.fleet.explicit_step(
+            reach, pushed if attached is None else attached.bound
+        )
         self._extremes = np.zeros((4, batch))
         self._rho = [np.ones((funnels.layout.rows, batch)) for funnels in (design.states, design.inputs)]
         self.reset(seed=0)
@@ -204,21 +223,22 @@ class Simulator:
         """Advance every environment by `dt` seconds.
 
         Args:
-            dt: step in s, positive.
+            dt: step in s, positive; done in equal parts where a drift can't take it (`AgentModel.explicit_step`).
             u: (m,) or (B, m) inputs held over the step, where the simulator has no law; the last ones if left out.
                 They are used as given: whoever needs the input limits, as a bounded g does, keeps them.
 
         Raises:
-            ValueError: for a step that isn't positive, or inputs given to a simulator with a law, misshapen or not
-                finite; the state is unchanged.
+            ValueError: for a step that isn't positive or would have too many parts, or inputs given to a simulator
+                with a law, misshapen or not finite; the state is unchanged.
             FunnelError: if an explicit step leaves the funnel; the state is the last one inside.
             SolveError: if a right-hand side gives numbers that aren't finite.
         """
         if not 0.0 < dt < math.inf:
             raise ValueError(f"dt must be positive and finite; got {dt!r}")
+        parts = self._parts(float(dt))
         if u is not None:
             self._hold(u)
-        self.integrator.step(self._state, float(dt))
+        self._advance(float(dt), parts)
         self._watch()
 
     def save(self) -> SimulatorState:
@@ -280,6 +300,26 @@ class Simulator:
             raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
         self._state.u.T[...] = given
         self.integrator.start(self._state)
+
+    def _parts(self, dt: float) -> int:
+        """Into how many equal parts a step is divided, so that the plant's own drift can take each of them."""
+        if dt > MOST_PARTS * self._longest_step:
+            raise ValueError(
+                f"dt = {dt:g} s is too long: the drift of {self.fleet.ids[self._stiffest]!r} takes "
+                f"{self._longest_step:.3g} s at a time, and no step is divided into more than {MOST_PARTS} parts; take "
+                f"dt of {MOST_PARTS * self._longest_step:.3g} s at most"
+            )
+        return max(1, math.ceil(dt / self._longest_step))
+
+    def _advance(self, dt: float, parts: int) -> None:
+        before = self._state.copy() if parts > 1 else None
+        try:
+            for _ in range(parts):
+                self.integrator.step(self._state, dt / parts)
+        except BaseException:
+            if before is not None:
+                self._state.assign(before)
+            raise
 
     def _disagreement(self, funnels: Funnels, estimate: FloatArray, source: FloatArray) -> FloatArray:
         out = np.zeros((funnels.layout.size, self.batch))
