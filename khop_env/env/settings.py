@@ -13,6 +13,7 @@ import numpy as np
 from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
 from khop_env.physics import did_you_mean
 from khop_env.simulation import OBSERVE, Observe
+from khop_env.simulation.integrators import MOST_THREADS
 
 Reward = Literal["agent", "team"]
 NUMBER = (int, float, np.integer, np.floating)
@@ -72,6 +73,8 @@ class Settings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"{name} must be a positive integer; got {value!r}")
+        if self.threads > MOST_THREADS:
+            raise ValueError(f"threads must be at most {MOST_THREADS}; got {self.threads!r}")
         for name in ("control_period", "dt", "success_radius", "limit"):
             value = getattr(self, name)
             if value is None and name in ("dt", "success_radius"):
@@ -80,6 +83,13 @@ class Settings:
                 raise ValueError(f"{name} must be a positive, finite number; got {value!r}")
         if not isinstance(self.effort, NUMBER) or not 0.0 <= self.effort < math.inf:
             raise ValueError(f"effort must be finite and not negative; got {self.effort!r}")
+        for name, value, least, most in (
+            ("control_period", self.control_period, 1e-9, 1e9),
+            ("dt", self.dt or self.control_period, self.control_period / 1e6, self.control_period),
+            ("limit", self.limit, 1e-30, 1e30),  # beside float32's own
+        ):
+            if not least <= value <= most * (1.0 + 1e-9):
+                raise ValueError(f"{name} must be between {least:g} and {most:g}; got {value!r}")
         object.__setattr__(self, "actuator", as_actuator(self.actuator))
         substeps = self.substeps  # refuses a period that isn't a whole number of steps
         if isinstance(self.actuator, Hold) and substeps == 1:

@@ -16,6 +16,8 @@ from khop_env.simulation.closed_loop import ClosedLoop
 from khop_env.simulation.solver import Solver
 from khop_env.simulation.state import SimulatorState
 
+MOST_THREADS = 256
+
 
 class SolveError(RuntimeError):
     """A step met numbers that aren't finite, in a state, an input, a disturbance or an estimate."""
@@ -85,7 +87,7 @@ class Proximal:
             it.
 
     Raises:
-        ValueError: for another order or fewer than one thread.
+        ValueError: for another order, or a number of threads that isn't one or is too large.
     """
 
     name = "proximal"
@@ -93,8 +95,8 @@ class Proximal:
     def __init__(self, order: int = 2, threads: int = 1) -> None:
         if order not in TABLEAUS:
             raise ValueError(f"the proximal step exists at order 1 and 2; got order={order!r}")
-        if threads < 1:
-            raise ValueError(f"threads must be at least 1; got {threads!r}")
+        if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or not 1 <= threads <= MOST_THREADS:
+            raise ValueError(f"threads must be an integer from 1 to {MOST_THREADS}; got {threads!r}")
         self.order, self.threads = order, threads
         self.evaluations = 0
         self._tableau = TABLEAUS[order]

@@ -69,6 +69,25 @@ class Extremes:
     input_relative: FloatArray
 
 
+def parts_of_step(dt: float, longest: float, agent: str) -> int:
+    """Into how many equal parts a step is divided, so that the plant's own drift can take each of them.
+
+    Args:
+        dt: step in s.
+        longest: what the drift takes (`Fleet.explicit_step`), in s.
+        agent: whose drift it is, for the error.
+
+    Raises:
+        ValueError: for more than `MOST_PARTS`.
+    """
+    if dt > MOST_PARTS * longest:
+        raise ValueError(
+            f"dt = {dt:g} s is too long: the drift of {agent!r} takes {longest:.3g} s at a time, and no step is "
+            f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
+        )
+    return max(1, math.ceil(dt / longest))
+
+
 class Simulator:
     """B copies of a fleet, its disturbances and its observers, advanced together.
 
@@ -235,7 +254,7 @@ class Simulator:
         """
         if not 0.0 < dt < math.inf:
             raise ValueError(f"dt must be positive and finite; got {dt!r}")
-        parts = self._parts(float(dt))
+        parts = parts_of_step(float(dt), self._longest_step, self.fleet.ids[self._stiffest])
         if u is not None:
             self._hold(u)
         self._advance(float(dt), parts)
@@ -300,16 +319,6 @@ class Simulator:
             raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
         self._state.u.T[...] = given
         self.integrator.start(self._state)
-
-    def _parts(self, dt: float) -> int:
-        """Into how many equal parts a step is divided, so that the plant's own drift can take each of them."""
-        if dt > MOST_PARTS * self._longest_step:
-            raise ValueError(
-                f"dt = {dt:g} s is too long: the drift of {self.fleet.ids[self._stiffest]!r} takes "
-                f"{self._longest_step:.3g} s at a time, and no step is divided into more than {MOST_PARTS} parts; take "
-                f"dt of {MOST_PARTS * self._longest_step:.3g} s at most"
-            )
-        return max(1, math.ceil(dt / self._longest_step))
 
     def _advance(self, dt: float, parts: int) -> None:
         before = self._state.copy() if parts > 1 else None

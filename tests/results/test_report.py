@@ -6,8 +6,9 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from agents import make_law
 from khop_env.observers import DesignError, Exponential, TargetObservers
-from khop_env.physics import AgentModel, SingleIntegrator, Sinusoid, Term
+from khop_env.physics import AgentModel, DoubleIntegrator, SingleIntegrator, Sinusoid, Term
 from khop_env.results import design_report
 from khop_env.scenarios import Scenario, paper
 from khop_env.scenarios.mixed_fleet import mixed_fleet
@@ -134,6 +135,73 @@ def test_a_bound_that_goes_below_its_own_infimum_is_refused():
     assert design_report(path_of(delta=Own(0.1, 0.1)))["feasible"] is True
     with pytest.raises(DesignError, match="Definition 1"):
         path_of(delta=Own(np.nan, 0.1)).build()
+
+
+class TestFloatingPoint:
+    def test_bounds_that_no_number_can_keep_are_refused_with_those_that_can(self):
+        """On the paper's tree |e| comes to 8 with delta(inf) = 3e-15 and states of 6 m."""
+        scenario = paper()
+        report = design_report(scenario.replace(delta=Exponential(14.077, 1e-14, 5.0)))
+        assert report["feasible"] is False
+        assert re.search(
+            r"delta\(inf\) = 1e-14 of 'drifter_\d', component 'x1', is too small for floating", report["error"]
+        )
+        enough = float(report["error"].rpartition(" ")[2])
+        assert 1e-14 < enough < 1e-10
+        assert design_report(scenario.replace(delta=Exponential(14.077, enough, 5.0)))["feasible"] is True
+
+    @pytest.mark.parametrize("make", [paper, mixed_fleet, lambda: random_geometric(agents=40, k=4)])
+    def test_those_that_are_said_to_be_kept_are_kept(self, make):
+        scenario = make()
+        lowest = 1e-30
+        while True:
+            tight = scenario.replace(delta=with_final(scenario.delta, lowest), duration=10.0)
+            report = design_report(tight)
+            if report["feasible"]:
+                break
+            assert "delta(inf)" in report["error"]
+            lowest = float(report["error"].rpartition(" ")[2])
+        simulator = tight.build(law=make_law(tight.law), batch=3)
+        for _ in range(round(tight.duration / tight.dt)):
+            simulator.step(tight.dt)
+        assert simulator.extremes.normalized.max() < 1.0
+        assert 1e-14 < lowest < 1e-9
+
+    def test_so_are_bounds_on_inputs(self):
+        report = design_report(paper().replace(theta=Exponential(231.39, 1e-16, 5.0)))
+        assert "theta(inf) = 1e-16 of 'drifter_" in report["error"]
+        assert re.search(r"where the input effect on x1 may be \d m/s, omega\(inf\) = ", report["error"])
+
+
+def with_final(bounds, final: float):
+    if isinstance(bounds, Exponential):
+        return Exponential(bounds.initial, final, bounds.rate)
+    if isinstance(bounds, dict):
+        return {kind: with_final(one, final) for kind, one in bounds.items()}
+    return [with_final(one, final) for one in bounds]
+
+
+def test_a_step_that_the_plants_drift_cannot_take_is_refused_before_the_start():
+    stiff = path_of(models=(DoubleIntegrator(damping=1e9),) * 4, dt=0.01)
+    report = design_report(stiff)
+    assert (report["plant_step_s"], report["plant_agent"]) == (1e-9, "cart_0")
+    assert report["feasible"] is False
+    assert "dt = 0.01 s is too long: the drift of 'cart_0' takes 1e-09 s at a time" in report["error"]
+    with pytest.raises(ValueError, match=r"dt = 0\.01 s is too long"):
+        stiff.build(law=make_law("tanh")).step(0.01)
+    assert design_report(paper())["plant_step_s"] is None
+    assert design_report(mixed_fleet())["plant_step_s"] == pytest.approx(0.0555, abs=1e-4)
+    assert design_report(mixed_fleet())["plant_agent"] == "vessel_0"
+
+
+def test_a_task_graph_that_falls_apart_is_worth_a_warning():
+    apart = nx.Graph([(0, 1), (2, 3)])
+    (warning,) = design_report(path_of(task=apart))["warnings"]
+    assert warning == (
+        "the task graph falls into 2 parts, which agree among themselves only: integrator_0, integrator_1; "
+        "integrator_2, integrator_3"
+    )
+    assert design_report(path_of())["warnings"] == []
 
 
 class Drizzle(Term):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents import make_law
-from khop_env.observers import Exponential
+from khop_env.observers import Exponential, TargetObservers
 from khop_env.physics import DriftingIntegrator, Sum, random_geometric_graph
 from khop_env.results import design_report
 from khop_env.scenarios import convoy, mixed_fleet, paper, random_geometric
@@ -129,9 +129,28 @@ def test_every_member_of_the_family_is_feasible(agents, k):
         assert np.all(simulator.extremes.normalized < 1.0)
 
 
-def test_random_geometric_refuses_three_agents():
-    with pytest.raises(ValueError, match="at least 4 agents; got agents=3"):
-        random_geometric(agents=3)
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"agents": 3}, "agents must be at least 4; got agents=3"),
+        ({"agents": 99999999999999999999}, "agents must be at most 100000; got agents=99999999999999999999"),
+        ({"agents": 10.0}, "agents must be an integer; got 10.0"),
+        ({"agents": True}, "agents must be an integer; got True"),
+        ({"k": 1}, "k must be at least 2; got k=1"),
+        ({"k": 2.5}, "k must be an integer; got 2.5"),
+        ({"seed": -1}, "seed must be at least 0; got seed=-1"),
+        ({"seed": 10**30}, "seed must be at most"),
+        ({"rate": np.nan}, "needs a positive, finite rate; got rate=nan"),
+    ],
+)
+def test_random_geometric_refuses_nonsense_before_it_draws_anything(given, message):
+    with pytest.raises(ValueError, match=message):
+        random_geometric(**given)
+
+
+def test_more_environments_than_memory_holds_are_refused():
+    with pytest.raises(ValueError, match=r"1000000000 environments of 'paper' have .*e\+.* states and estimates, more"):
+        paper().build(batch=10**9)
 
 
 def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
@@ -151,6 +170,21 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
         ({"radius": -1.0}, "radius must not be negative"),
         ({"dt": 0.0}, "dt must be positive"),
         ({"dt": np.inf}, "dt must be positive and finite; got inf"),
+        ({"dt": 1e-300}, "dt must be from 1e-09 to 1e.09 s; got 1e-300"),
+        ({"duration": 1e300}, "duration must be from .* got 1e.300"),
+        ({"duration": 10**400}, "duration must be from"),
+        ({"duration": 1e6, "dt": 1e-6}, r"1e\+12 steps, and 1e\+08 are the most; take dt of 0.01 s or more"),
+        ({"relay": "false"}, "relay must be True or False; got 'false'"),
+        (
+            {"observers": (TargetObservers(drift="no"),) * 8},
+            "the drift of its observers must be True or False; got 'no'",
+        ),
+        ({"order": 3}, "order must be 1 or 2; got 3"),
+        ({"name": "../../x"}, "name names a folder, too: 1 to 200 characters without '/'; got '../../x'"),
+        ({"name": ""}, "1 to 200 characters"),
+        ({"name": "n" * 201}, "1 to 200 characters"),
+        ({"name": "a\x1b[31mb"}, r"name must not have control characters; got 'a\\x1b\[31mb'"),
+        ({"description": "a\x07"}, "description must not have control characters"),
         ({"duration": np.nan}, "duration must be positive and finite; got nan"),
         ({"k": 2.5}, "k must be an integer, a number of hops; got 2.5"),
         ({"communication": nx.path_graph(7)}, "missing 7"),
