@@ -8,9 +8,19 @@ import pytest
 
 from agents import make_law
 from khop_env.observers import DesignError, Exponential, TargetObservers
-from khop_env.physics import AgentModel, DoubleIntegrator, SingleIntegrator, Sinusoid, Term
+from khop_env.physics import (
+    AgentModel,
+    Coupling,
+    DoubleIntegrator,
+    Gust,
+    SingleIntegrator,
+    Sinusoid,
+    Sum,
+    Term,
+    Unicycle,
+)
 from khop_env.results import design_report
-from khop_env.scenarios import Scenario, paper
+from khop_env.scenarios import LawChoice, Scenario, paper
 from khop_env.scenarios.mixed_fleet import mixed_fleet
 from khop_env.scenarios.random_geometric import random_geometric
 
@@ -241,6 +251,73 @@ class TestAssumptions:
         assert report["feasible"] is True
         assert assumption(design_report(path_of()), "5")["status"] == "holds"
         assert assumption(design_report(paper().replace(disturbance=None)), "5")["status"] == "not known"
+
+    def test_integrators_descend_what_is_said_to_decrease_at_their_limits_too(self):
+        """Where leaves of a star hardly move, its centre, above the mean, goes on up: |Pi x|^2 rises, and V falls."""
+        star = nx.star_graph(4)
+        scenario = path_of(
+            5,
+            communication=star,
+            task=star,
+            models=(SingleIntegrator(dim=1, input_limit=9.0),) + (SingleIntegrator(dim=1, input_limit=0.1),) * 4,
+            law=LawChoice("tanh", {"gain": 2.0}),
+            radius=10.0,
+        ).sized()
+        found = assumption(design_report(scenario), "5")
+        assert found["status"] == "holds"
+        assert "log cosh" in found["why"]
+        assert "inputs at their limits included" in found["why"]
+        simulator = scenario.build(law=make_law(scenario.law), observe="oracle")
+        simulator.reset(x0=[5.0, 6.0, 6.0, 6.0, -10.0])
+        edges = np.array(star.edges)
+        spreads, sums = [], []
+        for _ in range(400):
+            x = simulator.x
+            spreads.append(((x - x.mean(axis=1, keepdims=True)) ** 2).sum(axis=1))
+            sums.append(np.log(np.cosh(x[:, edges[:, 0]] - x[:, edges[:, 1]])).sum(axis=1))
+            simulator.step(0.01)
+        assert (np.diff(spreads, axis=0) > 1e-6).any()  # what was said to decrease once
+        assert (np.diff(sums, axis=0) <= 1e-12).all()
+
+    def test_a_disturbance_that_vanishes_at_agreement_says_nothing_against_it(self):
+        """Nor does one of states that positions don't follow; so nothing is claimed."""
+        for disturbance in (Coupling(0.5), Drizzle(0.2)):
+            found = assumption(design_report(path_of(disturbance=disturbance)), "5")
+            assert found["status"] == "not known"
+            assert "vanishes as agents meet, or is your own" in found["why"]
+        heading = Sinusoid((0.0, 0.0, 0.3))
+        bound = Exponential(10.0, 0.1, 5.0)
+        found = assumption(
+            design_report(path_of(models=(Unicycle(),) * 4, disturbance=heading, delta=bound, theta=None)), "5"
+        )
+        assert found["status"] == "not known"
+        assert assumption(design_report(path_of(disturbance=Sum())), "5")["status"] == "holds"
+        assert assumption(design_report(path_of(disturbance=Sum())), "1-iii")["why"] == "w = 0"
+
+    def test_the_gain_that_would_do_near_agreement_is_told(self):
+        """lambda_2 of the paper's task graph, with the law's own gain and where a file leaves it out."""
+        calm = paper().replace(disturbance=None)
+        enough = 1.0 / nx.algebraic_connectivity(calm.task)
+        assert f"= {enough:.4g} 1/s (here k_c = 2)" in assumption(design_report(calm), "5")["why"]
+        without = assumption(design_report(calm.replace(law=LawChoice("tanh"))), "5")["why"]
+        assert f"= {enough:.4g} 1/s; far" in without
+
+    def test_unbounded_g_is_bounded_in_time_only_if_the_law_makes_it_so(self):
+        free = (SingleIntegrator(input_limit=np.inf),) * 2 + (SingleIntegrator(input_limit=4.0),) * 2
+        found = assumption(design_report(path_of(models=free)), "2")
+        assert found["status"] == "not known"
+        assert found["why"].startswith(
+            "(i) g is bounded for 2 of 4 agents, |g| <= 4 in every component; (ii) for the 4"
+        )
+        assert assumption(design_report(path_of()), "2")["status"] == "holds"
+
+    def test_gusts_are_continuous_and_not_said_to_be_smooth(self):
+        why = assumption(design_report(path_of(disturbance=Gust(0.2))), "1-iii")["why"]
+        assert why == "|w| <= 0.2 in every component, as declared by Gust, all continuous"
+
+    def test_an_agent_alone_is_at_its_goal(self):
+        alone = path_of(1, delta=Exponential(1.0, 1.0, 1.0))
+        assert assumption(design_report(alone), "5")["status"] == "holds"
 
     def test_locally_lipschitz_drift_is_told(self):
         why = assumption(design_report(mixed_fleet()), "1-i")["why"]
