@@ -158,7 +158,7 @@ def _nominal_controller(scenario: Scenario) -> Assumption:
             "5",
             statement,
             "doesn't hold",
-            f"{_listed(sorted(lasting))} keeps pushing positions, and a law that doesn't know w can't cancel it: "
+            f"w pushes positions for good ({_listed(sorted(lasting))}), and a law that doesn't know w can't cancel it: "
             "agents come near the goal set at best. What estimates cost is the excess over the distance that agents "
             "keep under the true states (compare --observe oracle)",
         )
