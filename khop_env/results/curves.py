@@ -12,7 +12,7 @@ import numpy as np
 from khop_env.observers import FloatArray
 from khop_env.results.figures import COLORS, STYLE
 
-_DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
 
 
 def error_over_time(
