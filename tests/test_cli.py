@@ -290,6 +290,10 @@ class TestRun:
         assert "no law 'tan'; did you mean 'tanh'?" in refused("run", "paper", "--controller", "tan")
         assert "khop: dt must be positive and finite; got 0.0" in refused("run", "paper", "--dt", "0")
         assert "khop: duration must be positive" in refused("run", "paper", "--duration", "-1")
+        assert "dt must be from 1e-09 to 1e+09 s; got 1e-300" in refused("run", "paper", "--dt", "1e-300")
+        assert "duration must be from" in refused("run", "paper", "--duration", "1e-12")
+        assert "are 1e+12 steps, and 1e+08 are the most" in refused("run", "paper", "--duration", "1e6", "--dt", "1e-6")
+        assert "agents must be at most 100000" in refused("check", "random_geometric:agents=99999999999999999999")
         assert "forward Euler" in refused("run", "paper", "--integrator", "explicit", "--order", "2")
         assert "can't be read" in refused("run", "nowhere.toml")
         (folder / "taken").write_text("a file")
@@ -298,6 +302,15 @@ class TestRun:
             result = khop("run", "paper", option, value, status=2)
             assert result.stdout == ""
             assert "Traceback" not in result.stderr
+
+    def test_a_task_graph_that_falls_apart_is_told(self, folder):
+        text = khop("export", "paper").stdout
+        start = text.index("[task]\nedges = [")
+        stop = text.index("]\n\n", start)
+        (folder / "apart.toml").write_text(text[:start] + "[task]\nedges = [[0, 1], [2, 3]" + text[stop:])
+        warning = "the task graph falls into 6 parts, which agree among themselves only: drifter_0, drifter_1; "
+        assert f"khop: {warning}" in khop("run", "apart.toml", "--duration", "0.05").stderr
+        assert f"warning: {warning}" in " ".join(khop("check", "apart.toml").stdout.split()) + " "
 
 
 class TestExport:

@@ -19,7 +19,7 @@ from khop_env.simulation import InitialSet, Integrator, Law, Observe, Proximal, 
 MOST_AGENTS = 100_000
 SHORTEST_TIME, LONGEST_TIME = 1e-9, 1e9  # s
 MOST_STEPS = 100_000_000
-MOST_NUMBERS = 2**31  # estimates of all environments together, 16 GiB an array
+MOST_NUMBERS = 2**26  # states and estimates of all environments: about 10 GiB in all
 
 Bounds = PerformanceFunction | Mapping[str, Bound]
 """Bounds on estimation errors: one function for all agents, or one `Bound` per agent type."""
@@ -237,13 +237,13 @@ class Scenario:
             batch: number of copies B.
 
         Raises:
-            ValueError: for so many that no memory holds their estimates.
+            ValueError: for so many that memory wouldn't hold their estimates.
         """
         width = self.fleet.n + self.design.states.layout.size + self.design.inputs.layout.size
         if batch * width > MOST_NUMBERS:
             raise ValueError(
-                f"{batch} environments of {self.name!r} have {batch * width:.3g} states and estimates, more than "
-                f"memory holds; take {MOST_NUMBERS // width} at most"
+                f"{batch} environments of {self.name!r} have {batch * width:.3g} states and estimates; take "
+                f"{MOST_NUMBERS // width} at most, or build several"
             )
         return Simulator(
             self.design,

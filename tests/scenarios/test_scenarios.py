@@ -149,7 +149,9 @@ def test_random_geometric_refuses_nonsense_before_it_draws_anything(given, messa
 
 
 def test_more_environments_than_memory_holds_are_refused():
-    with pytest.raises(ValueError, match=r"1000000000 environments of 'paper' have .*e\+.* states and estimates, more"):
+    with pytest.raises(
+        ValueError, match=r"1000000000 environments of 'paper' have .*e\+.* states and estimates; take 5"
+    ):
         paper().build(batch=10**9)
 
 
