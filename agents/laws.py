@@ -52,14 +52,20 @@ def make_law(choice: LawChoice | str) -> Law:
     make = LAWS[choice.name]
     known = inspect.signature(make).parameters
     hints = get_type_hints(make)
+    parameters = dict(choice.parameters)
     for name, value in choice.parameters.items():
         if name not in known:
             raise LawError(f"law {choice.name!r} has no parameter {name!r}; {_known(name, list(known))}", name)
         expected = hints.get(name, known[name].annotation)
         if expected in (int, float, bool, str) and not fits(value, expected):
             raise LawError(f"{name} of law {choice.name!r} must be {describe(expected)}; got {value!r}", name)
+        if expected is float:
+            try:
+                parameters[name] = float(value)  # compiled loops take no integer of any size
+            except OverflowError:
+                raise LawError(f"{name} of law {choice.name!r} is too large for a number", name) from None
     try:
-        return make(**choice.parameters)
+        return make(**parameters)
     except (TypeError, ValueError) as error:
         raise LawError(str(error)) from error
 

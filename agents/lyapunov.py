@@ -141,7 +141,8 @@ def consensus_gain(scenario: Scenario, gain: float, *, bounded: bool) -> Compari
     degree, limit = max(count for _, count in task.degree), float(fleet.input_limit.min())
     if bounded and gain * degree > limit:
         return None
-    connectivity = float(np.linalg.eigvalsh(nx.laplacian_matrix(task, nodelist=range(len(fleet))).toarray())[1])
+    adjacency = nx.to_numpy_array(task)  # networkx's own Laplacian needs SciPy
+    connectivity = float(np.linalg.eigvalsh(np.diag(adjacency.sum(axis=0)) - adjacency)[1])
     unheard = max(sum(not scenario.communication.has_edge(i, j) for j in task[i]) for i in range(len(fleet)))
     return ComparisonGain(
         coupling=gain * connectivity,

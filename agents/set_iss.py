@@ -83,7 +83,7 @@ class Misinformed:
         """The law's inputs on the truth plus errors."""
         if self._seen is None:
             self._seen = dataclasses.replace(view)  # one object for all calls, as laws expect it
-        self._seen.x, self._seen.displacement = view.x, view.displacement.copy()
+        self._seen.x, self._seen.displacement = view.x, view.displacement.copy(order="K")
         self._seen.displacement[:, self._unheard] += self.errors(t, view)
         return self._law(t, self._seen)
 

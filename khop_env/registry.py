@@ -299,7 +299,10 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
         found = load_object(text)
         made = found(**parameters) if callable(found) else found
         if not isinstance(made, Scenario):
-            raise ValueError(f"{text} should be a Scenario or a function that returns one; got {type(made).__name__}")
+            raise ValueError(
+                f"{text} should be a Scenario or a function that returns one, e.g. my_file.py:my_scenario; got "
+                f"{type(made).__name__}"
+            )
         return made
     if name not in SCENARIOS:
         if text.lower().endswith(".toml") or Path(text).is_file():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import typer
 
 SHOWN_TARGETS = 20
 _SHOWN_IDS = 6  # of a k-hop set
+_PAGE = 80  # columns
 _PIPED_WIDTH = 160  # columns, where stdout is no terminal that could tell
 
 _UNSURE = 0.5  # s of work before it is guessed how long it will take
@@ -79,8 +81,23 @@ def waiting(label: str) -> Iterator[None]:
         yield
 
 
-def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> None:
-    """A table on stdout."""
+def print_table(
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    title: str | None = None,
+    *,
+    width: int = _PIPED_WIDTH,
+    whole: Sequence[str] = (),
+) -> None:
+    """A table on stdout; cells are folded between words.
+
+    Args:
+        header: names of the columns.
+        rows: their cells.
+        title: above it.
+        width: in characters, where stdout is no terminal that has one.
+        whole: columns that aren't folded at all.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -88,18 +105,24 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str
     table = Table(
         title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False, show_edge=False
     )
-    for name in header:
-        table.add_column(name, overflow="fold")
+    for number, name in enumerate(header):
+        longest = max(len(word) for text in (name, *(row[number] for row in rows)) for word in [*text.split(), ""])
+        table.add_column(name, overflow="fold", min_width=longest, no_wrap=name in whole)
     for row in rows:
         table.add_row(*row)
-    console = Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH, markup=False, highlight=False)
+    console = Console(width=None if sys.stdout.isatty() else width, markup=False, highlight=False)
     console.print(table)
 
 
+def print_text(text: str) -> None:
+    """A paragraph on stdout, in lines of 80 columns that break between words only."""
+    typer.echo(textwrap.fill(text, _PAGE, break_long_words=False, break_on_hyphens=False, subsequent_indent="  "))
+
+
 def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None:
-    """A run in five lines."""
+    """A run in a few lines."""
     observed = {"estimate": "estimates", "oracle": "the truth (oracle)", "local": "neighbours only"}[summary["observe"]]
-    typer.echo(
+    print_text(
         f"{summary['scenario']}: {summary['agents']} agents, {summary['pairs']} pairs of observer and target, "
         f"{summary['duration']:.6g} s in steps of {summary['dt']:g} s ({summary['integrator']}, order "
         f"{summary['order']}), {summary['controller']} on {observed}, seed {summary['seed']}"
@@ -110,21 +133,21 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
         ratios += f"; of the inputs |mu|/omega {_ratio(summary['max_normalized_disagreement_input'])}, "
         ratios += f"|g_tilde|/theta {_ratio(summary['max_error_to_bound_input'])}"
     if summary["funnel_kept"]:
-        typer.echo(f"guarantee kept: largest {ratios} (all below 1)")
+        print_text(f"guarantee kept: largest {ratios} (all below 1)")
     elif summary["error"] is not None:
-        typer.echo(f"guarantee not kept: stopped at t = {summary['duration']:.6g} s; until then largest {ratios}")
+        print_text(f"guarantee not kept: stopped at t = {summary['duration']:.6g} s; until then largest {ratios}")
     else:
-        typer.echo(f"guarantee not kept: largest {ratios} (should be below 1)")
+        print_text(f"guarantee not kept: largest {ratios} (should be below 1)")
     if "environment" in summary:
-        typer.echo(f"{summary['environment']}: task error at the end {summary['final_task_error']:.4g} m")
+        print_text(f"{summary['environment']}: task error at the end {summary['final_task_error']:.4g} m")
     else:
         error = summary["final_consensus_error"]
-        typer.echo(f"consensus error at the end: {'not finite' if error is None else f'{error:.4g} m'}")
+        print_text(f"consensus error at the end: {'not finite' if error is None else f'{error:.4g} m'}")
     if summary["diverged"]:
-        typer.echo(
+        print_text(
             "the states grew without bound: it seems that the plant diverged; try a smaller --dt, or another law"
         )
-    typer.echo(f"wall time: {summary['wall_time_s']:.3g} s for {summary['steps']} steps")
+    print_text(f"wall time: {summary['wall_time_s']:.3g} s for {summary['steps']} steps")
     tables = ", ".join(str(files[name]) for name in ("estimates", "states") if name in files)
     for what, where in (("tables", tables), ("summary", files.get("summary")), ("figure", files.get("figure"))):
         if where:
@@ -142,62 +165,73 @@ def _ratio(value: float | None) -> str:
 
 def print_design(report: Mapping[str, Any]) -> None:
     """The design report as tables."""
-    typer.echo(
+    print_text(
         f"{report['scenario']}: {report['agents']} agents, {report['edges']} edges, k = {report['k']}, "
         f"{'with' if report['relay'] else 'without'} relay"
     )
     targets = report["targets"]
     if targets:
-        rows = [row for target in targets[:SHOWN_TARGETS] for row in _target_rows(target)]
-        header = (
-            "target",
-            "k-hop set",
-            "eta",
-            "lambda(M)",
-            "of",
-            "bound on errors",
-            "funnel",
-            "rate (1/s)",
-            "start/funnel",
+        shown = targets[:SHOWN_TARGETS]
+        print_table(
+            ("target", "k-hop set", "eta", "lambda(M)"),
+            [_spectrum_row(target) for target in shown],
+            "Observers, by the agent that they estimate",
+            width=_PAGE,
+            whole=("target", "lambda(M)"),
         )
-        print_table(header, rows, "Observers, by the agent that they estimate: values at t = 0 -> infinity")
+        typer.echo()
+        print_table(
+            ("target", "of", "delta, theta", "rho, omega", "rate (1/s)", "start / funnel"),
+            [row for target in shown for row in _funnel_rows(target)],
+            "Bounds on errors and funnels on disagreements, at t = 0 -> infinity",
+            width=_PAGE,
+            whole=("target", "delta, theta", "rho, omega"),
+        )
         if len(targets) > SHOWN_TARGETS:
-            typer.echo(_all_targets(targets))
+            print_text(_all_targets(targets))
         bound = {kind: value for kind, value in report["explicit_step_bound_s"].items() if value is not None}
         values = ", ".join(f"{value:.3g} s ({kind} observers)" for kind, value in bound.items())
-        typer.echo(f"explicit integrator: no step longer than {values} is stable; take a tenth of it or less\n")
+        print_text(f"explicit integrator: no step longer than {values} is stable; take a tenth of it or less")
+    if report["plant_step_s"] is not None:
+        print_text(
+            f"plant: steps longer than {report['plant_step_s']:.3g} s are divided, since the drift of "
+            f"{report['plant_agent']} takes no longer ones"
+        )
     if report["assumptions"]:
-        rows = [(one["number"], one["status"], one["statement"], one["why"]) for one in report["assumptions"]]
-        print_table(("", "status", "assumption of the paper", "why"), rows)
+        typer.echo()
+        rows = [(one["number"], one["status"], f"{one['statement']}: {one['why']}") for one in report["assumptions"]]
+        print_table(("", "status", "assumption of the paper, and why"), rows, width=_PAGE, whole=("", "status"))
+    for warning in report["warnings"]:
+        print_text(f"warning: {warning}")
     if report["feasible"]:
         shares = [group["start_share"] for target in targets for kind in ("state", "input") for group in target[kind]]
         later = "; where |g| is unbounded, a run checks at its start that inputs begin inside" if None in shares else ""
-        typer.echo(f"feasible: every condition of the observers holds{later}")
+        print_text(f"feasible: every condition of the observers that can be checked before the start holds{later}")
     else:
-        typer.echo(f"not feasible: {report['error']}")
+        print_text(f"not feasible: {report['error']}")
 
 
-def _target_rows(target: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _spectrum_row(target: Mapping[str, Any]) -> tuple[str, ...]:
     ids = target["k_hop"]
     members = ", ".join(ids[:_SHOWN_IDS]) + (f" and {len(ids) - _SHOWN_IDS} more" if len(ids) > _SHOWN_IDS else "")
-    first: tuple[str, ...] = (
-        target["agent"],
-        members,
-        str(target["eta"]),
-        f"{target['lambda_min']:.4g} .. {target['lambda_max']:.4g}",
-    )
+    spectrum = f"{target['lambda_min']:.4g} .. {target['lambda_max']:.4g}"
+    return target["agent"], members, str(target["eta"]), spectrum
+
+
+def _funnel_rows(target: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    who = target["agent"]
     for kind, bound, funnel in (("state", "delta", "rho"), ("input", "theta", "omega")):
         for group in target[kind]:
             share = group["start_share"]
             yield (
-                *first,
+                who,
                 f"{kind} {', '.join(group['components'])}",
-                f"{bound} {_span(group[bound])}",
-                f"{funnel} {_span(group[funnel])}",
+                _span(group[bound]),
+                _span(group[funnel]),
                 "" if group[funnel]["rate"] is None else f"{group[funnel]['rate']:g}",
-                "seen at reset" if share is None else f"{_ratio(share)}{'' if share < 1.0 else ': no'}",
+                "at reset" if share is None else f"{_ratio(share)}{'' if share < 1.0 else ': no'}",
             )
-            first = ("", "", "", "")
+            who = ""
 
 
 def _span(function: Mapping[str, float | None]) -> str:

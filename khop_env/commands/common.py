@@ -44,6 +44,9 @@ def mistakes(name: str | None = None) -> Iterator[None]:
     """Tell of a mistake in what was asked in one paragraph, without a traceback; `name` is the scenario's."""
     try:
         yield
+    except MemoryError as error:
+        say(f"khop: there isn't enough memory for that: {error}")
+        raise typer.Exit(2) from None
     except (ValueError, OSError, ModuleNotFoundError) as error:
         from khop_env.observers import DesignError
 

@@ -75,6 +75,8 @@ def run(
     from khop_env.observers import Explicit, Proximal
     from khop_env.results import RunFileError, record, summarize, write_run
     from khop_env.results.metrics import finite
+    from khop_env.scenarios.scenario import number_of_steps
+    from khop_env.simulation.simulator import parts_of_step
 
     explicit = integrator is IntegratorOption.EXPLICIT
     with mistakes(name), waiting(f"designing the observers of {name}"):
@@ -88,9 +90,7 @@ def run(
             raise ValueError("--order 2: the explicit integrator is forward Euler, of order 1; leave --order out")
         duration = scenario.duration if duration is None else duration
         dt = dt if dt is not None else EXPLICIT_STEP if explicit else scenario.dt
-        for option, value in (("--duration", duration), ("--dt", dt)):
-            if not 0.0 < value < float("inf"):
-                raise ValueError(f"{option} must be positive and finite; got {value!r}")
+        number_of_steps(duration, dt)  # refuses what couldn't be played, before anything is built
         simulator: Any
         played: BatchedEnv | None = None
         if learned:
@@ -101,9 +101,13 @@ def run(
         else:
             law = _law(scenario, controller)
             controller = law.name
+            longest, stiffest = scenario.longest_step
+            parts_of_step(dt, longest, scenario.fleet.ids[stiffest])
             stepper = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
             simulator = scenario.build(law=make_law(law), observe=observe.value, observers=stepper)
             simulator.reset(seed)
+            for warning in scenario.warnings:
+                say(f"khop: {warning}")
         shown = _film(video, observer, scenario)
         folder = out or Path("runs") / folder_name(scenario.name)
         folder.mkdir(parents=True, exist_ok=True)  # before anything is computed that could be lost

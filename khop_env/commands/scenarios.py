@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from khop_env.commands.common import JsonOption, ScenarioArgument, in_words_of_the_file, load, mistakes, print_json
-from khop_env.terminal import print_table, waiting
+from khop_env.terminal import print_table, print_text, waiting
 
 
 def list_scenarios(as_json: JsonOption = False) -> None:
@@ -22,8 +22,9 @@ def list_scenarios(as_json: JsonOption = False) -> None:
             (one["name"], ", ".join(f"{key}={value}" for key, value in one["parameters"].items()), one["description"])
             for one in found
         ],
+        width=80,
     )
-    typer.echo(f"environments: {', '.join(environments())}")
+    print_text(f"environments: {', '.join(environments())}")
 
 
 def check(name: ScenarioArgument, as_json: JsonOption = False) -> None:

@@ -96,6 +96,7 @@ class BatchedEnv:
             inputs,
             np.zeros((self._read_observations.task_rows, self.num_envs)),
         )
+        self._parts = simulator.parts_of(settings.control_period / settings.substeps)
         self._command, self._physical = np.zeros_like(inputs), np.zeros_like(inputs)
         self._cycles, self._over = np.zeros(self.num_envs, np.int64), np.ones(self.num_envs, bool)
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
@@ -262,7 +263,7 @@ class BatchedEnv:
             self.task.drive(self.world, self._physical)
             inputs[self._driven] = self._physical[self._driven] / self._limit[self._driven]
         self.simulator.hold(self._physical)
-        self.simulator.advance(dt)
+        self.simulator.advance(dt, self._parts)
 
     def _evaluate(self) -> Outcome:
         return self.task.evaluate(self.world)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
 
 from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
+from khop_env.observers.proximal import MOST_THREADS
 from khop_env.physics import did_you_mean
 from khop_env.simulation import OBSERVE, Observe
 
@@ -61,12 +61,19 @@ class Settings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"{name} must be a positive integer; got {value!r}")
+        if self.threads > MOST_THREADS:
+            raise ValueError(f"threads must be at most {MOST_THREADS}; got {self.threads!r}")
         for name in ("control_period", "dt", "limit"):
             value = getattr(self, name)
             if value is None and name == "dt":
                 continue
-            if not isinstance(value, NUMBER) or not 0.0 < value < math.inf:
-                raise ValueError(f"{name} must be a positive, finite number; got {value!r}")
+            if not isinstance(value, NUMBER) or not 0.0 < value <= 1e30:  # float32 ends at 3e38
+                raise ValueError(f"{name} must be a positive, finite number of at most 1e30; got {value!r}")
+        if not 1e-9 <= self.control_period <= 1e9 or (self.dt is not None and self.dt < 1e-6 * self.control_period):
+            raise ValueError(
+                "control_period must be from 1e-9 to 1e9 s, and at most a million simulator steps; got "
+                f"control_period = {self.control_period:g} s" + ("" if self.dt is None else f" and dt = {self.dt:g} s")
+            )
         object.__setattr__(self, "actuator", as_actuator(self.actuator))
         substeps = self.substeps  # refuses a period that isn't a whole number of steps
         if isinstance(self.actuator, Hold) and substeps == 1:

@@ -252,15 +252,25 @@ class PairLayout:
 
     @cached_property
     def eigenvalues(self) -> FloatArray:
-        """(targets, 2): smallest and largest eigenvalue of each M_i."""
+        """(targets, 2): smallest and largest eigenvalue of each M_i; equal matrices, as those of a star, count once."""
+        alike: dict[tuple[bytes, ...], list[int]] = {}
+        arrays = self.arrays
+        for index, block in enumerate(self.blocks):
+            start = arrays.entry_start[block.pairs.start : block.pairs.stop + 1]
+            content = arrays.diagonal[block.pairs], start - start[0], arrays.entry[start[0] : start[-1]]
+            alike.setdefault(tuple(part.tobytes() for part in content), []).append(index)
+        groups = list(alike.values())
+        sizes = arrays.observers[[members[0] for members in groups]]
         extremes = np.zeros((len(self.target), 2))
-        observers = self.arrays.observers
-        for eta in np.unique(observers):
-            members = np.flatnonzero(observers == eta)
+        for eta in np.unique(sizes):
+            same = [groups[number] for number in np.flatnonzero(sizes == eta)]
             # eigvalsh takes a stack; a slice at a time keeps ten thousand targets within the memory of a few
-            for some in np.array_split(members, max(1, len(members) * int(eta) ** 2 // 1_000_000)):
-                spectrum = np.linalg.eigvalsh(np.stack([self.matrix(index) for index in some]))
-                extremes[some] = spectrum[:, [0, -1]]
+            step = max(1, 1_000_000 // int(eta) ** 2)
+            for first in range(0, len(same), step):
+                some = same[first : first + step]
+                spectrum = np.linalg.eigvalsh(np.stack([self.matrix(members[0]) for members in some]))
+                for members, values in zip(some, spectrum, strict=True):
+                    extremes[members] = values[[0, -1]]
         return extremes
 
 

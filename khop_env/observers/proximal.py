@@ -40,6 +40,9 @@ TABLEAUS = {
 }
 
 
+MOST_THREADS = 256
+
+
 class Proximal(FunnelObservers):
     """The barrier implicit, everything else explicit: |e| < 1 at every grid point, whatever the step.
 
@@ -54,7 +57,7 @@ class Proximal(FunnelObservers):
         evaluations: of the barrier, in all steps so far.
 
     Raises:
-        ValueError: if there is no such order, or threads is below 1.
+        ValueError: if there is no such order, or threads is out of range.
     """
 
     name = "proximal"
@@ -63,8 +66,8 @@ class Proximal(FunnelObservers):
     def __init__(self, order: int = 2, threads: int = 1) -> None:
         if order not in TABLEAUS:
             raise ValueError(f"the proximal step exists at order 1 and 2; got order={order!r}")
-        if threads < 1:
-            raise ValueError(f"threads must be at least 1; got {threads!r}")
+        if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or not 1 <= threads <= MOST_THREADS:
+            raise ValueError(f"threads must be an integer from 1 to {MOST_THREADS}; got {threads!r}")
         self.order, self.threads = order, threads
         self.evaluations = 0
         self._tableau = TABLEAUS[order]

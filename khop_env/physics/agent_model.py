@@ -130,6 +130,19 @@ class AgentModel:
         """Lipschitz constant of the drift in the 2-norm: inf if it is only locally Lipschitz, nan if not declared."""
         return math.nan
 
+    def explicit_step(self, reach: FloatArray, disturbance: FloatArray) -> float:
+        """Longest step of an explicit method, in s, in which the drift can't make states explode; inf if any will do.
+
+        This default is inf, right for a drift that is bounded or slow. A model whose drift is stiff, as a strong drag
+        is, overrides it: an explicit method multiplies what decays at the rate r by about 1 - r dt, so that steps
+        beyond 2 / r grow. Simulators divide longer steps.
+
+        Args:
+            reach: Largest |x| that agents start with, shape (n,).
+            disturbance: Largest |w|, in state units per second, shape (n,).
+        """
+        return math.inf
+
     def input_map_bound(self) -> FloatArray:
         """Bound on each component of |g_i| over all states and all inputs within their limits, shape (n,).
 

@@ -15,6 +15,10 @@ from khop_env.physics.disturbance import Channels, Term, freeze_list
 from khop_env.physics.fleet import Fleet
 from khop_env.physics.waveforms import add_coupling, add_gusts, add_sines
 
+_MOST_DRAWN = 10_000  # sines or pulses of one channel
+_SHORTEST_PULSE = 1e-6  # s
+_HIGHEST_FREQUENCY = 1e6  # rad/s: above it the angle of a long run is rounded
+
 
 @dataclass(frozen=True)
 class BandLimitedNoise(Term):
@@ -38,8 +42,7 @@ class BandLimitedNoise(Term):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_range(self, "band")
-        if self.components < 1:
-            raise ValueError(f"{self.__class__.__name__}.components must be at least 1; got {self.components!r}")
+        _check_count(self, "components")
 
     def draw(self, rng: np.random.Generator, channels: Channels) -> FloatArray:
         """Angular frequencies and phases, shape (2, components, C)."""
@@ -96,10 +99,12 @@ class Gust(Term):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.duration <= self.period < math.inf:
-            raise ValueError(f"Gust needs 0 < duration <= period; got duration {self.duration}, period {self.period}")
-        if self.pulses < 1:
-            raise ValueError(f"Gust.pulses must be at least 1; got {self.pulses!r}")
+        if not _SHORTEST_PULSE <= self.duration <= self.period < math.inf:
+            raise ValueError(
+                f"Gust needs {_SHORTEST_PULSE:g} <= duration <= period, in s; got duration {self.duration}, period "
+                f"{self.period}"
+            )
+        _check_count(self, "pulses")
 
     def draw(self, rng: np.random.Generator, channels: Channels) -> FloatArray:
         """Beginnings within the window in seconds, and signs, shape (2, pulses, C)."""
@@ -151,10 +156,19 @@ DISTURBANCES: dict[str, type[Term]] = {
 def _check_range(term: Term, name: str) -> None:
     freeze_list(term, name)
     value = getattr(term, name)
-    if not (isinstance(value, tuple) and len(value) == 2 and 0 < value[0] <= value[1] < math.inf):
+    if not (isinstance(value, tuple) and len(value) == 2 and 0 < value[0] <= value[1] <= _HIGHEST_FREQUENCY):
         raise ValueError(
-            f"{term.__class__.__name__}.{name} must be (lowest, highest) in rad/s with 0 < lowest <= highest; "
-            f"got {value!r}"
+            f"{term.__class__.__name__}.{name} must be (lowest, highest) in rad/s with 0 < lowest <= highest, at most "
+            f"{_HIGHEST_FREQUENCY:g}; got {value!r}"
+        )
+
+
+def _check_count(term: Term, name: str) -> None:
+    value = getattr(term, name)
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= _MOST_DRAWN:
+        raise ValueError(
+            f"{term.__class__.__name__}.{name} must be an integer from 1 to {_MOST_DRAWN}, as all are drawn "
+            f"beforehand; got {value!r}"
         )
 
 

@@ -181,6 +181,32 @@ class Fleet:
             _fill(out, group, group.model.input_map(t, states, inputs), states.shape, "input_map(t, x, u)")
         return out
 
+    def explicit_step(self, reach: FloatArray, disturbance: FloatArray) -> tuple[float, int]:
+        """The shortest `AgentModel.explicit_step` of all agents.
+
+        Args:
+            reach: Largest |x| that they start with, shape (n,).
+            disturbance: Largest |w|, in state units per second, shape (n,).
+
+        Returns:
+            The step in seconds, inf if any will do, and the index of the first agent that asks for it.
+
+        Raises:
+            ValueError: A model declares a step that isn't positive.
+        """
+        steps = [
+            model.explicit_step(reach[part], disturbance[part])
+            for model, part in ((model, self.state_slice(i)) for i, model in enumerate(self.models))
+        ]
+        for i, step in enumerate(steps):
+            if not step > 0.0:
+                raise ValueError(
+                    f"{self.models[i].__class__.__name__}.explicit_step must return a positive number of seconds, or "
+                    f"math.inf; got {step!r} for {self.ids[i]!r}"
+                )
+        shortest = min(range(len(self)), key=steps.__getitem__)
+        return float(steps[shortest]), shortest
+
     def positions(self, x: FloatArray) -> FloatArray:
         """Positions of all agents, shape (B, N, d), from fleet states (B, n)."""
         return np.take(x, self.position_index, axis=-1)

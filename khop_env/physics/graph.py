@@ -68,22 +68,27 @@ def hop_distances(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
     """
     _require_hops(cutoff)
     neighbors = [list(graph.adj[node]) for node in range(len(graph))]
-    distances = []
-    for source in range(len(neighbors)):
-        found = {source: 0}
-        frontier = [source]
-        for hops in range(1, cutoff + 1):
-            reached = []
-            for node in frontier:
-                for neighbor in neighbors[node]:
-                    if neighbor not in found:
-                        found[neighbor] = hops
-                        reached.append(neighbor)
-            if not reached:
-                break
-            frontier = reached
-        distances.append(found)
-    return distances
+    sets = [frozenset(adjacent) for adjacent in neighbors]
+    return [_reached_from(source, cutoff, neighbors, sets) for source in range(len(neighbors))]
+
+
+def _reached_from(source: int, cutoff: int, neighbors: list[list[int]], sets: list[frozenset[int]]) -> dict[int, int]:
+    """{agent: distance} from one source. Few of a dense graph's edges lead to somebody new: sets find them quickly."""
+    found = {source: 0}
+    frontier = [source]
+    for hops in range(1, cutoff + 1):
+        reached: list[int] = []
+        for node in frontier:
+            if len(found) == len(neighbors):
+                return found
+            fresh = sets[node].difference(found)
+            if fresh:
+                reached += [neighbor for neighbor in neighbors[node] if neighbor in fresh]  # the order of the edges
+                found.update(dict.fromkeys(reached[-len(fresh) :], hops))
+        if not reached:
+            break
+        frontier = reached
+    return found
 
 
 def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[int, ...], ...]:

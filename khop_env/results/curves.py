@@ -12,7 +12,7 @@ import numpy as np
 from khop_env.observers import FloatArray
 from khop_env.results.figures import COLORS, STYLE
 
-_DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
 
 
 def error_over_time(
@@ -32,6 +32,7 @@ def error_over_time(
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     policies = list(dict.fromkeys(policy for policy, _ in errors))
     modes = list(dict.fromkeys(mode for _, mode in errors))
@@ -40,17 +41,26 @@ def error_over_time(
         axes = figure.subplots()
         for (policy, mode), values in errors.items():
             number = policies.index(policy) if len(policies) > 1 else modes.index(mode)
-            color = COLORS[number % len(COLORS)]
+            color, dashes = COLORS[number % len(COLORS)], _DASHES[modes.index(mode) % len(_DASHES)]
             low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=1)
-            dashes = _DASHES[modes.index(mode) % len(_DASHES)]
-            axes.plot(time, middle, color=color, linestyle=dashes, label=f"{policy} on {mode}")
+            axes.plot(time, middle, color=color, linestyle=dashes)
             axes.fill_between(time, low, high, color=color, alpha=0.12, linewidth=0.0)
         axes.set_yscale("log")
         axes.set_xlim(0.0, float(time[-1]))
         axes.set_xlabel("time (s)")
         axes.set_ylabel("task error, mean over agents (m)")
         figure.suptitle(title, fontsize=10.5, color="#333333")
-        figure.legend(loc="outside right center", fontsize=8.5, handlelength=3.0)
+        # an entry for each colour and each kind of dashes: rows that coincide, as those of blind policies, need no more
+        entries = [
+            Line2D([], [], color=COLORS[number % len(COLORS)], label=policy)
+            for number, policy in enumerate(policies)
+            if len(policies) > 1
+        ]
+        for number, mode in enumerate(modes):
+            color = "#333333" if entries else COLORS[number % len(COLORS)]
+            name = f"on {mode}" if len(policies) > 1 else f"{policies[0]} on {mode}"
+            entries.append(Line2D([], [], color=color, linestyle=_DASHES[number % len(_DASHES)], label=name))
+        figure.legend(handles=entries, loc="outside right center", fontsize=8.5, handlelength=3.0)
         figure.savefig(path, dpi=150)
     return Path(path)
 

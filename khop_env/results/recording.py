@@ -11,6 +11,7 @@ import numpy as np
 
 from khop_env.observers import Extremes, FloatArray, FunnelBank, FunnelError, Funnels, ObserverDesign, SolveError
 from khop_env.physics import Fleet
+from khop_env.scenarios.scenario import number_of_steps
 from khop_env.simulation import Simulator
 
 Progress = Callable[[float], None]
@@ -136,14 +137,14 @@ def record(
         The recording. Where the integrator gave up midway, `Recording.error` says why, and all samples before stand.
 
     Raises:
-        ValueError: for more than one environment, or a duration or step that isn't positive and finite.
+        ValueError: for more than one environment, or a duration or step that isn't positive and finite, or too short
+            or long for the other.
     """
     if simulator.num_envs != 1:
         raise ValueError(f"one environment is recorded at a time; the simulator has num_envs={simulator.num_envs}")
-    for name, value in (("duration", duration), ("dt", dt), ("samples_per_second", samples_per_second)):
-        if not (value > 0.0 and math.isfinite(value)):
-            raise ValueError(f"{name} must be positive and finite; got {value!r}")
-    steps = max(1, math.ceil(duration / dt - 1e-9))
+    steps = number_of_steps(duration, dt)
+    if not 0.0 < samples_per_second < math.inf:
+        raise ValueError(f"samples_per_second must be positive and finite; got {samples_per_second!r}")
     design = simulator.design
     width = max(1, design.states.layout.size, design.inputs.layout.size)
     most_samples = max(2, MOST_ROWS // width)

@@ -10,6 +10,7 @@ import numpy as np
 from khop_env.observers import DesignError, Exponential, FloatArray, Funnels, ObserverDesign, PerformanceFunction
 from khop_env.results.assumptions import assumptions
 from khop_env.scenarios import Scenario
+from khop_env.simulation.simulator import parts_of_step
 
 
 def design_report(scenario: Scenario) -> dict[str, Any]:
@@ -42,6 +43,9 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         "pairs": None,
         "estimates": None,
         "explicit_step_bound_s": {"state": None, "input": None},
+        "plant_step_s": None,
+        "plant_agent": None,
+        "warnings": scenario.warnings,
         "targets": [],
         "assumptions": [],
     }
@@ -49,12 +53,17 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         design = scenario.design
     except DesignError as error:
         return {**report, "error": str(error)}
+    longest, agent = scenario.longest_step
+    if np.isfinite(longest):
+        report |= {"plant_step_s": longest, "plant_agent": scenario.fleet.ids[agent]}
     bound = scenario.fleet.input_map_bound
     radius = {"state": scenario.initial.radius, "input": bound}
     try:  # as the simulator does: where g is unbounded, its reset checks where the inputs start
         design.require_feasible_start(scenario.initial.radius, np.where(np.isfinite(bound), bound, 0.0))
+        parts_of_step(scenario.dt, longest, scenario.fleet.ids[agent])
+        _require_digits(scenario)
         report["feasible"] = True
-    except DesignError as error:
+    except ValueError as error:
         report["error"] = str(error)
     report["pairs"] = design.states.layout.pairs
     report["estimates"] = design.states.layout.size + design.inputs.layout.size
@@ -69,6 +78,44 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
     report["targets"] = list(targets.values())
     report["assumptions"] = [vars(one) for one in assumptions(scenario)]
     return report
+
+
+_DIGITS = 4.0  # units in the last place of an estimate that rho has to exceed, for each link of its observer
+_REGION = 10.0  # states are taken to stay within this many times the initial set
+
+
+def _require_digits(scenario: Scenario) -> None:
+    """Refuse bounds that floating point can't keep: an estimate is rounded to a unit in its last place.
+
+    A disagreement adds up as many differences of estimates as its observer has links, d_a, each off by a unit or so.
+    States are taken to stay within `_REGION` times the initial set, or as far as inputs and disturbances drive them.
+
+    Raises:
+        DesignError: naming agent, component and the smallest delta (theta) at infinity that can be kept there.
+    """
+    fleet, design = scenario.fleet, scenario.design
+    reach = np.abs(scenario.initial.center) + scenario.initial.radius
+    pushed = 0.0 if scenario.disturbance is None else scenario.disturbance.attach(fleet).bound
+    inputs = np.where(np.isfinite(fleet.input_map_bound), fleet.input_map_bound, 0.0)
+    region = {"state": np.maximum(_REGION * reach, reach + scenario.duration * (inputs + pushed)), "input": inputs}
+    for kind, funnels in _kinds(design):
+        layout, (bound, funnel) = funnels.layout, _LETTERS[kind]
+        if not layout.size:
+            continue
+        links = np.maximum.reduceat(layout.arrays.diagonal, layout.arrays.pair)[layout.row_target]
+        largest = region[kind][layout.row_source]
+        needed = _DIGITS * links * np.spacing(largest)
+        rho = funnels.rho.infimum()
+        row = int(np.argmax(needed / rho))
+        if rho[row] < needed[row]:
+            who, name, unit = fleet.component_names()[layout.row_source[row]]
+            what, unit = (name, unit) if kind == "state" else (f"input effect on {name}", f"{unit}/s")
+            raise DesignError(
+                f"{bound}(inf) = {funnels.delta.infimum()[row]:.3g} of {who!r}, component {name!r}, is too small for "
+                f"floating point: where the {what} may be {largest[row]:.3g} {unit}, {funnel}(inf) = {rho[row]:.3g} "
+                f"has to exceed {_DIGITS * links[row]:g} units in its last place, {needed[row]:.3g}; take {bound}(inf) "
+                f"above {1.05 * needed[row] / funnels.gain[row]:.2g}"
+            )
 
 
 _LETTERS = {"state": ("delta", "rho"), "input": ("theta", "omega")}

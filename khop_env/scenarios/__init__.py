@@ -1,8 +1,9 @@
 """THE ASSEMBLY: one file, one named problem."""
 
+from khop_env.scenarios.convoy import convoy
 from khop_env.scenarios.mixed_fleet import mixed_fleet
 from khop_env.scenarios.paper import paper
 from khop_env.scenarios.random_geometric import random_geometric
 from khop_env.scenarios.scenario import Bounds, LawChoice, Scenario
 
-__all__ = ["Bounds", "LawChoice", "Scenario", "mixed_fleet", "paper", "random_geometric"]
+__all__ = ["Bounds", "LawChoice", "Scenario", "convoy", "mixed_fleet", "paper", "random_geometric"]

@@ -69,6 +69,7 @@ def write_scenario(scenario: Scenario) -> str:
         _bounds(scenario, scenario.delta, "delta"),
         "Bounds on the state estimation errors: (initial - final) exp(-rate t) + final. For different bounds per type",
         "of agent write [delta.TYPE] tables; values there may be lists, one for each state.",
+        'initial = "auto" starts 25 % above what the initial set needs (khop check shows the number).',
     )
     if scenario.theta is not None:
         bounds = _bounds(scenario, scenario.theta, "theta")

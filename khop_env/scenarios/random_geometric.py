@@ -9,7 +9,7 @@ import numpy as np
 
 from khop_env.observers import Exponential
 from khop_env.physics import SingleIntegrator, Sinusoid, hop_distances, random_geometric_graph
-from khop_env.scenarios.scenario import LawChoice, Scenario
+from khop_env.scenarios.scenario import MOST_AGENTS, LawChoice, Scenario
 
 MEAN_DEGREE = 5.0
 GAIN = 2.0
@@ -31,12 +31,19 @@ def random_geometric(agents: int = 100, k: int = 2, seed: int = 0, rate: float =
         rate: at which the bounds on estimates fall, in 1/s.
 
     Raises:
-        ValueError: for fewer than 4 agents, k below 2, a negative seed or a rate that isn't positive.
+        ValueError: for fewer than 4 agents or more than 100 000, k below 2, a negative or huge seed, or a rate that
+            isn't positive.
     """
-    if agents < 4:
-        raise ValueError(f"random_geometric needs at least 4 agents; got agents={agents}")
-    if seed < 0:
-        raise ValueError(f"random_geometric needs a seed that isn't negative; got seed={seed}")
+    for name, value, least, most in (
+        ("agents", agents, 4, MOST_AGENTS),
+        ("k", k, 2, 2**63),
+        ("seed", seed, 0, 2**63),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise ValueError(f"random_geometric: {name} must be an integer; got {value!r}")
+        if not least <= value <= most:
+            bound = f"at least {least}" if value < least else f"at most {most}"
+            raise ValueError(f"random_geometric: {name} must be {bound}; got {name}={value}")
     if not 0.0 < rate < math.inf:
         raise ValueError(f"random_geometric needs a positive, finite rate; got rate={rate}")
     rng = np.random.default_rng(seed)

@@ -25,6 +25,11 @@ from khop_env.observers import (
 from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
 from khop_env.simulation import InitialSet, Law, Observe, Simulator
 
+MOST_AGENTS = 100_000
+SHORTEST_TIME, LONGEST_TIME = 1e-9, 1e9  # s
+MOST_STEPS = 100_000_000
+MOST_NUMBERS = 2**26  # states and estimates of all environments: about 10 GiB in all
+
 Bounds = PerformanceFunction | Mapping[str, Bound]
 """Bounds on estimation errors: one function for all agents, or one `Bound` per agent type."""
 
@@ -83,11 +88,11 @@ class Scenario:
     order: int = 2
 
     def __post_init__(self) -> None:
+        self._check_values()
         agents = len(self.models)
-        validate_graph(self.communication, agents)
-        check_task_graph(
-            validate_graph(self.task, agents, name="task graph", connected=False), self.communication, self.k
-        )
+        # copies without attributes: an edge counts once, whatever weight it carries
+        object.__setattr__(self, "communication", validate_graph(self.communication, agents))
+        object.__setattr__(self, "task", check_task_graph(self.task, self.communication, self.k))
         for name in ("center", "radius"):
             values = np.asarray(getattr(self, name), dtype=float)
             if values.shape not in ((), (self.fleet.n,)) or not np.all(np.isfinite(values)):
@@ -98,11 +103,34 @@ class Scenario:
             object.__setattr__(self, name, np.broadcast_to(values, (self.fleet.n,)).copy())
         if np.any(np.asarray(self.radius) < 0.0):
             raise ValueError(f"scenario {self.name!r}: radius must not be negative")
-        for name in ("duration", "dt"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(
-                    f"scenario {self.name!r}: {name} must be positive and finite; got {getattr(self, name)!r}"
-                )
+
+    def _check_values(self) -> None:
+        """What can be seen without fleet and graphs."""
+        for key, text in (("name", self.name), ("description", self.description.replace("\n", ""))):
+            if not text.isprintable():
+                raise ValueError(f"scenario {self.name!r}: {key} must not have control characters; got {text!r}")
+        if not 0 < len(self.name) <= 200 or "/" in self.name:
+            raise ValueError(
+                f"a scenario's name names a folder, too: 1 to 200 characters without '/'; got {self.name[:200]!r}"
+            )
+        for what, values in (
+            ("relay", [self.relay]),
+            ("the drift of its observers", [option.drift for option in self.observers or ()]),
+            ("the input_observer of its observers", [option.input_observer for option in self.observers or ()]),
+        ):
+            for value in values:
+                if not isinstance(value, bool | np.bool):
+                    raise ValueError(f"scenario {self.name!r}: {what} must be True or False; got {value!r}")
+        if self.order not in (1, 2):
+            raise ValueError(f"scenario {self.name!r}: order must be 1 or 2; got {self.order!r}")
+        if not 0 < len(self.models) <= MOST_AGENTS:
+            raise ValueError(
+                f"scenario {self.name!r}: expected 1 to {MOST_AGENTS} models, one per agent; got {len(self.models)}"
+            )
+        try:
+            number_of_steps(self.duration, self.dt)
+        except ValueError as error:
+            raise ValueError(f"scenario {self.name!r}: {error}") from None
 
     def replace(self, **changes: Any) -> Scenario:
         """A copy with some attributes changed."""
@@ -117,6 +145,25 @@ class Scenario:
     def initial(self) -> InitialSet:
         """Where states start."""
         return InitialSet(np.asarray(self.center), np.asarray(self.radius))
+
+    @cached_property
+    def longest_step(self) -> tuple[float, int]:
+        """Longest step in s that no agent's drift asks to divide (inf if any will do), and whose drift it is."""
+        reach = np.abs(self.initial.center) + self.initial.radius
+        bound = np.zeros(self.fleet.n) if self.disturbance is None else self.disturbance.attach(self.fleet).bound
+        return self.fleet.explicit_step(reach, bound)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is allowed, but seldom meant."""
+        parts = [[self.fleet.ids[i] for i in sorted(part)] for part in nx.connected_components(self.task)]
+        if len(parts) < 2:
+            return []
+        first = [", ".join(part[:4]) + (", ..." if len(part) > 4 else "") for part in sorted(parts)[:4]]
+        return [
+            f"the task graph falls into {len(parts)} parts, which agree among themselves only: "
+            f"{'; '.join(first)}{'; ...' if len(parts) > 4 else ''}"
+        ]
 
     @cached_property
     def design(self) -> ObserverDesign:
@@ -197,7 +244,16 @@ class Scenario:
             observe: what the law sees of agents out of earshot.
             observers: how they are stepped; `Proximal` of the scenario's `order` by default.
             num_envs: number of environments B.
+
+        Raises:
+            ValueError: for so many that memory wouldn't hold their estimates.
         """
+        width = self.fleet.n + self.design.states.layout.size + self.design.inputs.layout.size
+        if num_envs * width > MOST_NUMBERS:
+            raise ValueError(
+                f"{num_envs} environments of {self.name!r} have {num_envs * width:.3g} states and estimates; take "
+                f"{MOST_NUMBERS // width} at most, or build several"
+            )
         return Simulator(
             self.design,
             self.initial,
@@ -217,6 +273,25 @@ class Scenario:
             if key not in types:
                 raise ValueError(f"scenario {self.name!r}: {name} is given for {key!r}; {did_you_mean(key, types)}")
         return {i: bounds[model.type] for i, model in enumerate(self.models) if model.type in bounds}
+
+
+def number_of_steps(duration: float, dt: float) -> int:
+    """Steps of `dt` seconds that an experiment takes, the last one shortened.
+
+    Raises:
+        ValueError: for a duration or step that isn't positive and finite, or steps too short or too many.
+    """
+    for name, value in (("duration", duration), ("dt", dt)):
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"{name} must be positive and finite; got {value!r}")
+        if not SHORTEST_TIME <= value <= LONGEST_TIME:
+            raise ValueError(f"{name} must be from {SHORTEST_TIME:g} to {LONGEST_TIME:g} s; got {value!r}")
+    if duration / dt > MOST_STEPS:
+        raise ValueError(
+            f"duration = {duration:g} s in steps of dt = {dt:g} s are {duration / dt:.3g} steps, and {MOST_STEPS:g} "
+            f"are the most; take dt of {duration / MOST_STEPS:.2g} s or more, or a shorter duration"
+        )
+    return max(1, math.ceil(duration / dt - 1e-9))
 
 
 _SAMPLED_TIMES = np.concatenate([np.linspace(0.0, 10.0, 1001), np.geomspace(10.0, 1000.0, 1001)])  # s

@@ -28,9 +28,12 @@ from khop_env.observers.disagreement import disagreement
 from khop_env.physics import read_only
 from khop_env.simulation.plant import FleetPlant
 from khop_env.simulation.state import LinkState, SimulatorState
-from khop_env.simulation.view import Law, Observe, ViewBuilder
+from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
 
 _WARM_UP_STEP = 1e-9  # s: short enough for any observers, long enough to run all of their code
+
+MOST_PARTS = 10_000
+"""Steps of the integrator that one `Simulator.step` may be divided into."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +43,45 @@ class InitialSet:
     Attributes:
         center: (n,) in the states' units.
         radius: (n,) half widths, not negative.
+
+    Raises:
+        ValueError: if they differ in shape, or a number isn't finite or a half width negative.
     """
 
     center: FloatArray
     radius: FloatArray
 
+    def __post_init__(self) -> None:
+        center, radius = np.asarray(self.center, dtype=float), np.asarray(self.radius, dtype=float)
+        if center.ndim != 1 or center.shape != radius.shape or not np.isfinite([center, radius]).all():
+            raise ValueError(f"center and radius must be finite, (n,) each; got {self.center!r} and {self.radius!r}")
+        if (radius < 0.0).any():
+            raise ValueError(f"radius must not be negative; got {radius.min():g} for component {radius.argmin()}")
+        object.__setattr__(self, "center", center)
+        object.__setattr__(self, "radius", radius)
+
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """One (n,) initial state."""
         return self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
+
+
+def parts_of_step(dt: float, longest: float, agent: str) -> int:
+    """Into how many equal parts a step is divided, so that the plant's own drift can take each of them.
+
+    Args:
+        dt: step in s.
+        longest: what the drift takes (`Fleet.explicit_step`), in s.
+        agent: whose drift it is, for the error.
+
+    Raises:
+        ValueError: for more than `MOST_PARTS`.
+    """
+    if dt > MOST_PARTS * longest:
+        raise ValueError(
+            f"dt = {dt:g} s is too long: the drift of {agent!r} takes {longest:.3g} s at a time, and no step is "
+            f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
+        )
+    return max(1, math.ceil(dt / longest))
 
 
 class Simulator:
@@ -87,6 +121,8 @@ class Simulator:
     ) -> None:
         if law is not None and task is None:
             raise ValueError("a law acts along the edges of a task graph; give task=")
+        if observe not in OBSERVE:
+            raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {observe!r}")
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1; got {num_envs!r}")
         self.design, self.fleet, self.initial, self.num_envs = design, design.fleet, initial, num_envs
@@ -110,6 +146,10 @@ class Simulator:
         )
         self._before = self.state.copy()
         self._extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
+        reach, pushed = np.abs(initial.center) + initial.radius, np.zeros(self.fleet.n)
+        self._longest_step, self._stiffest = self.fleet.explicit_step(
+            reach, pushed if attached is None else attached.bound
+        )
         self.reset(seed=0)
 
     # -- reading -------------------------------------------------------------------------------------------------
@@ -217,22 +257,23 @@ class Simulator:
         """Advance every environment by `dt` seconds.
 
         Args:
-            dt: step in s, positive.
+            dt: step in s, positive; done in equal parts where a drift can't take it (`AgentModel.explicit_step`).
             u: (m,) or (B, m) inputs held over the step, where the simulator has no law; the last ones if left out.
                 They are not clipped: keep them within `input_limit` if the design assumes a bounded input map.
 
         Raises:
-            ValueError: for a step that isn't positive, or inputs given to a simulator with a law, misshapen or not
-                finite; the state is unchanged.
+            ValueError: for a step that isn't positive or would have too many parts, or inputs given to a simulator
+                with a law, misshapen or not finite; the state is unchanged.
             FunnelError: if an explicit step leaves the funnel; the state is the last one inside.
             SolveError: if a right-hand side gives numbers that aren't finite; likewise.
         """
         if not 0.0 < dt < math.inf:
             raise ValueError(f"dt must be positive and finite; got {dt!r}")
+        parts = self.parts_of(dt)
         if u is not None:
             self.state.u.T[...] = self._checked_inputs(u)
             self.plant.actuate(self.state)
-        self.advance(float(dt))
+        self.advance(float(dt), parts)
 
     def hold(self, u: FloatArray) -> None:
         """Hold inputs (m, B) from now on; batch last, and not checked: for callers that have done so.
@@ -243,22 +284,39 @@ class Simulator:
         self.state.u[...] = u
         self.plant.actuate(self.state)
 
-    def advance(self, dt: float) -> None:
-        """`step` with the inputs in force, and without checking `dt`: for callers that have done so."""
+    def parts_of(self, dt: float) -> int:
+        """Into how many equal parts `step` divides a step, so that the plant's own drift can take each of them.
+
+        Raises:
+            ValueError: for more than `MOST_PARTS`.
+        """
+        return parts_of_step(dt, self._longest_step, self.fleet.ids[self._stiffest])
+
+    def advance(self, dt: float, parts: int) -> None:
+        """`step` with the inputs in force, and without checks: for callers that have done them.
+
+        Args:
+            dt: step in s.
+            parts: `parts_of(dt)`.
+        """
         state, before = self.state, self._before
+        start = state.copy() if parts > 1 else before
         state.copy_step(before)
         try:
-            self.observers.advance(self.plant, before, state, dt)
+            for part in range(parts):
+                if part:
+                    state.copy_step(before)
+                self.observers.advance(self.plant, before, state, dt / parts)
+                self.observers.raise_extremes(state, self._extremes)
         except BaseException:
-            before.copy_step(state)
+            start.copy_step(state)
             raise
-        self.observers.raise_extremes(state, self._extremes)
 
     def warm_up(self) -> None:
         """Compile everything that a step runs; the state stays as it is."""
         saved, seen = self.save(), self._extremes.copied()
         try:
-            self.advance(_WARM_UP_STEP)
+            self.advance(_WARM_UP_STEP, 1)
         except (FunnelError, SolveError):
             pass  # the first real step will raise it again
         finally:

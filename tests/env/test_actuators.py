@@ -25,11 +25,11 @@ def watched(env):
     simulator, seen = env.batched.simulator, []
     advance = simulator.advance
 
-    def spied(dt):
+    def spied(dt, parts):
         assert dt == pytest.approx(PERIOD / SUBSTEPS)
         held = simulator.u.copy()
         seen.append(held[0] / env.batched.fleet.input_limit)
-        advance(dt)
+        advance(dt, parts)
         np.testing.assert_array_equal(simulator.u, held)
 
     simulator.advance = spied

@@ -203,10 +203,10 @@ WRONG_SETTINGS = {
     "bounds": (1, "bounds must be True or False; got 1"),
     "uniform": ("yes", "uniform must be True or False; got 'yes'"),
     "max_cycles": (0, "max_cycles must be a positive integer; got 0"),
-    "control_period": (0.0, "control_period must be a positive, finite number; got 0.0"),
-    "dt": (-0.01, "dt must be a positive, finite number; got -0.01"),
-    "success_radius": (float("nan"), "success_radius must be a positive, finite number; got nan"),
-    "limit": (float("inf"), "limit must be a positive, finite number; got inf"),
+    "control_period": (0.0, "control_period must be a positive, finite number of at most 1e30; got 0.0"),
+    "dt": (-0.01, "dt must be a positive, finite number of at most 1e30; got -0.01"),
+    "success_radius": (float("nan"), "success_radius must be a positive, finite number of at most 1e30; got nan"),
+    "limit": (float("inf"), "limit must be a positive, finite number of at most 1e30; got inf"),
     "effort": (-0.1, "effort must be finite and not negative; got -0.1"),
     "order": (3, "exists at order 1 and 2; got order=3"),
     "threads": (0, "threads must be"),
@@ -222,6 +222,22 @@ def test_wrong_settings_are_refused(name):
     value, message = WRONG_SETTINGS[name]
     with pytest.raises(ValueError, match=message):
         consensus_v0.parallel_env(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"threads": 10**6}, "threads must be at most 256; got 1000000"),
+        ({"control_period": 1e-300}, "control_period must be from 1e-9 to 1e9 s.* got control_period = 1e-300 s"),
+        ({"control_period": 1e20}, "from 1e-9 to 1e9 s"),
+        ({"control_period": 10**400}, "control_period must be a positive, finite number of at most 1e30"),
+        ({"dt": 1e-300}, "a million simulator steps; got control_period = 0.05 s and dt = 1e-300 s"),
+        ({"limit": 1e39}, "limit must be a positive, finite number of at most 1e30"),
+    ],
+)
+def test_settings_of_any_size_are_refused_before_anything_is_built(settings, message):
+    with pytest.raises(ValueError, match=message):
+        consensus_v0.parallel_env(**settings)
 
 
 @pytest.mark.parametrize("max_cycles", [True, 2.0, "5", None])

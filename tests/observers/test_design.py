@@ -211,3 +211,15 @@ def test_explicit_step_bound_is_where_euler_stops_damping(system):
         for factor, stable in ((0.999, True), (1.001, False)):
             spread = np.linalg.eigvalsh(np.eye(len(m)) - factor * bound[index] * 4.0 / rho**2 * m)
             assert (np.abs(spread).max() < 1.0) == stable
+
+
+def test_equal_matrices_are_solved_once(monkeypatch):
+    """Every leaf of a star is estimated by all the others, with one and the same M_i."""
+    solved = []
+    eigvalsh = np.linalg.eigvalsh
+    monkeypatch.setattr(np.linalg, "eigvalsh", lambda stack: solved.append(len(stack)) or eigvalsh(stack))
+    layout = ObserverDesign(scalar_fleet(21), nx.star_graph(20), 2, ONE, ONE).states.layout
+    assert layout.eigenvalues.shape == (20, 2)
+    assert sum(solved) == 1
+    for index in range(20):
+        assert layout.eigenvalues[index] == pytest.approx(eigvalsh(layout.matrix(index))[[0, -1]])

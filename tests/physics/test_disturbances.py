@@ -221,9 +221,13 @@ def test_kinds() -> None:
         (lambda: Sinusoid(1.0, frequency=(2.0, 1.0)), r"Sinusoid.frequency must be \(lowest, highest\)"),
         (lambda: Sinusoid(1.0, frequency=2.0), r"got 2.0"),  # type: ignore[arg-type]
         (lambda: BandLimitedNoise(1.0, band=(0.0, 1.0)), "0 < lowest"),
-        (lambda: BandLimitedNoise(1.0, components=0), "components must be at least 1"),
-        (lambda: Gust(1.0, duration=2.0, period=1.0), "0 < duration <= period; got duration 2.0, period 1.0"),
-        (lambda: Gust(1.0, pulses=0), "pulses must be at least 1"),
+        (lambda: BandLimitedNoise(1.0, components=0), "components must be an integer from 1 to"),
+        (lambda: Gust(1.0, duration=2.0, period=1.0), "<= duration <= period, in s; got duration 2.0, period 1.0"),
+        (lambda: BandLimitedNoise(1.0, components=10**9), "from 1 to 10000, as all are drawn beforehand; got 10000000"),
+        (lambda: BandLimitedNoise(1.0, components=2.5), "components must be an integer .*; got 2.5"),  # type: ignore[arg-type]
+        (lambda: Sinusoid(1.0, frequency=(1.0, 1e300)), r"at most 1e\+06; got"),
+        (lambda: Gust(1.0, duration=1e-300, period=1e-300), "1e-06 <= duration <= period"),
+        (lambda: Gust(1.0, pulses=0), "pulses must be an integer from 1 to"),
         (lambda: Coupling(1.0, gain=math.inf), "gain must be finite"),
         (lambda: Sinusoid(1.0, agents="vesel").attach(FLEET), "no agent or type 'vesel'; did you mean 'vessel'"),
         (lambda: Gust(1.0, agents=("cart_7",)).attach(FLEET), "no agent or type 'cart_7'; did you mean 'cart_"),

@@ -30,6 +30,17 @@ def test_hop_distances_are_shortest_paths(graph: nx.Graph, cutoff: int) -> None:
     assert hop_distances(graph, cutoff) == [found for _, found in nx.all_pairs_shortest_path_length(graph, cutoff)]
 
 
+@given(graph=GRAPHS)
+def test_hop_distances_list_agents_as_a_search_along_the_edges_meets_them(graph: nx.Graph) -> None:
+    """Generated scenarios draw from these lists, so that their order decides what a seed gives."""
+    for source, found in enumerate(hop_distances(graph, len(graph))):
+        assert list(found) == [source, *(agent for _, agent in nx.bfs_edges(graph, source))]
+
+
+def test_a_dense_graph_is_searched_no_longer_than_somebody_is_left() -> None:
+    assert hop_distances(nx.complete_graph(1500), 10**9)[7] == {7: 0, **dict.fromkeys({*range(1500)} - {7}, 1)}
+
+
 @given(graph=GRAPHS, k=st.integers(2, 6))
 def test_k_hop_neighbors_are_those_at_distance_2_to_k(graph: nx.Graph, k: int) -> None:
     distance = dict(nx.all_pairs_shortest_path_length(graph))

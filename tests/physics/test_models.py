@@ -15,12 +15,14 @@ from khop_env.physics import (
     AgentModel,
     DoubleIntegrator,
     DriftingIntegrator,
+    Fleet,
     FloatArray,
     SingleIntegrator,
     SurfaceVessel,
     Unicycle,
     drifting_integrator_drift,
 )
+from khop_env.scenarios import mixed_fleet
 
 LIBRARY = pytest.mark.parametrize("model", [kind() for kind in MODELS.values()], ids=list(MODELS))
 SEEDS = st.integers(0, 2**32 - 1)
@@ -210,5 +212,71 @@ def test_missing_parts_are_named() -> None:
 def test_library_parameters_are_checked() -> None:
     with pytest.raises(ValueError, match="must be 1, 2 or 3; got 4"):
         SingleIntegrator(4)
-    with pytest.raises(ValueError, match="mass must be three positive numbers"):
+    with pytest.raises(ValueError, match="mass must be three positive, finite numbers"):
         SurfaceVessel(mass=(1, 0, 1))
+    for dim in (2.0, True, "2"):
+        with pytest.raises(ValueError, match="must be 1, 2 or 3"):
+            SingleIntegrator(dim)
+    for damping in (math.nan, math.inf, -1e9):
+        with pytest.raises(ValueError, match="damping must be finite and not negative"):
+            DoubleIntegrator(damping)
+    for name in ("mass", "linear_drag", "quadratic_drag"):
+        for value in (math.nan, math.inf, -1.0):
+            with pytest.raises(ValueError, match=rf"{name} must be three .*, finite numbers .*; got \(1.0, {value}"):
+                SurfaceVessel(**{name: (1.0, value, 1.0)})
+
+
+class TestExplicitStep:
+    """What a drift says of the longest explicit step, which simulators divide longer ones by."""
+
+    def test_slow_and_bounded_drifts_take_any(self) -> None:
+        for model in (SingleIntegrator(), DriftingIntegrator(), Unicycle(), DoubleIntegrator(damping=0.0)):
+            assert model.explicit_step(np.full(model.n, 1e6), np.full(model.n, 1e6)) == math.inf
+
+    def test_a_cart_takes_its_time_constant(self) -> None:
+        assert DoubleIntegrator(damping=4.0).explicit_step(np.ones(4), np.zeros(4)) == 0.25
+
+    def test_a_vessel_takes_less_the_faster_it_gets(self) -> None:
+        """By its start, its inputs or a disturbance; the usual steps of 0.05 s are never divided in mixed_fleet."""
+        slow, still = np.zeros(6), np.zeros(6)
+        vessel, strong = SurfaceVessel(), SurfaceVessel(input_limit=(30.0, 40.0, 5.0))
+        fast, pushed = np.array([0, 0, 0, 5.0, 5.0, 5.0]), np.array([0, 0, 0, 1.0, 1.0, 1.0])
+        usual = vessel.explicit_step(slow, still)
+        assert 0.1 < usual < 1.0
+        for shorter in (
+            vessel.explicit_step(fast, still),
+            vessel.explicit_step(slow, pushed),
+            strong.explicit_step(slow, still),
+        ):
+            assert shorter < usual
+        assert SurfaceVessel(input_limit=math.inf).explicit_step(slow, still) > usual  # nothing is known but the start
+        chosen = mixed_fleet()
+        bound = chosen.disturbance.attach(chosen.fleet).bound
+        assert chosen.fleet.explicit_step(chosen.initial.radius, bound) == (pytest.approx(0.0555, abs=1e-4), 9)
+
+    @pytest.mark.parametrize("order", [1, 2])
+    def test_a_vessel_does_not_explode_in_steps_of_its_own(self, order: int) -> None:
+        """With inputs at their limits that flip, stay, or push along the motion, which raises the energy most."""
+        rng = np.random.default_rng(0)
+        for vessel in (SurfaceVessel(), SurfaceVessel(input_limit=(30.0, 40.0, 5.0))):
+            dt = vessel.explicit_step(np.zeros(6), np.zeros(6))
+            limit, t = vessel.input_limit, np.zeros((30, 1))
+            x, held = np.zeros((30, 1, 6)), rng.choice((-1.0, 1.0), (30, 1, 3))
+            for _ in range(2000):
+                flip = rng.choice((-1.0, 1.0), (30, 1, 3))
+                push = np.where(x[..., 3:] >= 0.0, 1.0, -1.0)
+                u = limit * np.concatenate([flip[:10], held[10:20], push[20:]])
+                rate = vessel.drift(t, x) + vessel.input_map(t, x, u)
+                if order == 2:
+                    middle = x + 0.5 * dt * rate
+                    rate = vessel.drift(t, middle) + vessel.input_map(t, middle, u)
+                x = x + dt * rate
+            assert np.abs(x[..., 3:]).max() < 25.0
+
+    def test_a_step_that_is_none_is_refused(self) -> None:
+        model = SingleIntegrator()
+        object.__setattr__(model, "explicit_step", lambda reach, disturbance: 0.0)
+        with pytest.raises(
+            ValueError, match=r"explicit_step must return a positive number .*; got 0\.0 for 'integrator_1'"
+        ):
+            Fleet([DoubleIntegrator(), SingleIntegrator(), model]).explicit_step(np.zeros(8), np.zeros(8))

@@ -3,7 +3,7 @@ import pytest
 from matplotlib.image import imread
 
 from agents import make_law
-from khop_env.results import figures, paper_figure, record
+from khop_env.results import error_over_time, figures, paper_figure, record
 from khop_env.scenarios import paper
 from khop_env.scenarios.mixed_fleet import mixed_fleet
 
@@ -85,3 +85,29 @@ def test_an_unknown_agent_is_refused(tmp_path):
     scenario = paper()
     with pytest.raises(ValueError, match="no agent 8"):
         paper_figure(recorded(scenario, 0.02), scenario, tmp_path / "figure.png", agent=8)
+
+
+def legend_of(rows: list[tuple[str, str]], tmp_path, monkeypatch) -> list[str]:
+    """The legend's entries for rows of a table of policies and observation modes."""
+    from matplotlib.figure import Figure
+
+    kept = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kw: (kept.append(figure), save(figure, *args, **kw)))
+    time = np.linspace(0.0, 1.0, 5)
+    errors = {row: np.exp(-time)[:, None] * np.ones((1, 3)) for row in rows}
+    assert error_over_time(time, errors, tmp_path / "errors.png", "title").exists()
+    (legend,) = kept[0].legends
+    assert len(kept[0].axes[0].lines) == len(rows)
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_errors_of_many_rows_have_an_entry_for_each_policy_and_each_mode(tmp_path, monkeypatch):
+    policies, modes = ["leader_following", "linear", "tanh", "zero", "random"], ["estimate", "oracle", "local"]
+    rows = [(policy, mode) for policy in policies for mode in modes]
+    assert legend_of(rows, tmp_path, monkeypatch) == [*policies, *(f"on {mode}" for mode in modes)]
+
+
+def test_errors_of_a_single_policy_have_an_entry_for_each_mode(tmp_path, monkeypatch):
+    rows = [("tanh", "estimate"), ("tanh", "oracle")]
+    assert legend_of(rows, tmp_path, monkeypatch) == ["tanh on estimate", "tanh on oracle"]

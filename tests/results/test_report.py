@@ -6,10 +6,21 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from agents import make_law
 from khop_env.observers import DesignError, Exponential, TargetObservers
-from khop_env.physics import AgentModel, SingleIntegrator, Sinusoid, Term
+from khop_env.physics import (
+    AgentModel,
+    Coupling,
+    DoubleIntegrator,
+    Gust,
+    SingleIntegrator,
+    Sinusoid,
+    Sum,
+    Term,
+    Unicycle,
+)
 from khop_env.results import design_report
-from khop_env.scenarios import Scenario, paper
+from khop_env.scenarios import LawChoice, Scenario, paper
 from khop_env.scenarios.mixed_fleet import mixed_fleet
 from khop_env.scenarios.random_geometric import random_geometric
 
@@ -136,6 +147,73 @@ def test_a_bound_that_goes_below_its_own_infimum_is_refused():
         path_of(delta=Own(np.nan, 0.1)).build()
 
 
+class TestFloatingPoint:
+    def test_bounds_that_no_number_can_keep_are_refused_with_those_that_can(self):
+        """On the paper's tree |e| comes to 8 with delta(inf) = 3e-15 and states of 6 m."""
+        scenario = paper()
+        report = design_report(scenario.replace(delta=Exponential(14.077, 1e-14, 5.0)))
+        assert report["feasible"] is False
+        assert re.search(
+            r"delta\(inf\) = 1e-14 of 'drifter_\d', component 'x1', is too small for floating", report["error"]
+        )
+        enough = float(report["error"].rpartition(" ")[2])
+        assert 1e-14 < enough < 1e-10
+        assert design_report(scenario.replace(delta=Exponential(14.077, enough, 5.0)))["feasible"] is True
+
+    @pytest.mark.parametrize("make", [paper, mixed_fleet, lambda: random_geometric(agents=40, k=4)])
+    def test_those_that_are_said_to_be_kept_are_kept(self, make):
+        scenario = make()
+        lowest = 1e-30
+        while True:
+            tight = scenario.replace(delta=with_final(scenario.delta, lowest), duration=10.0)
+            report = design_report(tight)
+            if report["feasible"]:
+                break
+            assert "delta(inf)" in report["error"]
+            lowest = float(report["error"].rpartition(" ")[2])
+        simulator = tight.build(law=make_law(tight.law), num_envs=3)
+        for _ in range(round(tight.duration / tight.dt)):
+            simulator.step(tight.dt)
+        assert simulator.extremes.normalized.max() < 1.0
+        assert 1e-14 < lowest < 1e-9
+
+    def test_so_are_bounds_on_inputs(self):
+        report = design_report(paper().replace(theta=Exponential(231.39, 1e-16, 5.0)))
+        assert "theta(inf) = 1e-16 of 'drifter_" in report["error"]
+        assert re.search(r"where the input effect on x1 may be \d m/s, omega\(inf\) = ", report["error"])
+
+
+def with_final(bounds, final: float):
+    if isinstance(bounds, Exponential):
+        return Exponential(bounds.initial, final, bounds.rate)
+    if isinstance(bounds, dict):
+        return {kind: with_final(one, final) for kind, one in bounds.items()}
+    return [with_final(one, final) for one in bounds]
+
+
+def test_a_step_that_the_plants_drift_cannot_take_is_refused_before_the_start():
+    stiff = path_of(models=(DoubleIntegrator(damping=1e9),) * 4, dt=0.01)
+    report = design_report(stiff)
+    assert (report["plant_step_s"], report["plant_agent"]) == (1e-9, "cart_0")
+    assert report["feasible"] is False
+    assert "dt = 0.01 s is too long: the drift of 'cart_0' takes 1e-09 s at a time" in report["error"]
+    with pytest.raises(ValueError, match=r"dt = 0\.01 s is too long"):
+        stiff.build(law=make_law("tanh")).step(0.01)
+    assert design_report(paper())["plant_step_s"] is None
+    assert design_report(mixed_fleet())["plant_step_s"] == pytest.approx(0.0555, abs=1e-4)
+    assert design_report(mixed_fleet())["plant_agent"] == "vessel_0"
+
+
+def test_a_task_graph_that_falls_apart_is_worth_a_warning():
+    apart = nx.Graph([(0, 1), (2, 3)])
+    (warning,) = design_report(path_of(task=apart))["warnings"]
+    assert warning == (
+        "the task graph falls into 2 parts, which agree among themselves only: integrator_0, integrator_1; "
+        "integrator_2, integrator_3"
+    )
+    assert design_report(path_of())["warnings"] == []
+
+
 class Drizzle(Term):
     """A disturbance of a user's own."""
 
@@ -173,6 +251,73 @@ class TestAssumptions:
         assert report["feasible"] is True
         assert assumption(design_report(path_of()), "5")["status"] == "holds"
         assert assumption(design_report(paper().replace(disturbance=None)), "5")["status"] == "not known"
+
+    def test_integrators_descend_what_is_said_to_decrease_at_their_limits_too(self):
+        """Where leaves of a star hardly move, its centre, above the mean, goes on up: |Pi x|^2 rises, and V falls."""
+        star = nx.star_graph(4)
+        scenario = path_of(
+            5,
+            communication=star,
+            task=star,
+            models=(SingleIntegrator(dim=1, input_limit=9.0),) + (SingleIntegrator(dim=1, input_limit=0.1),) * 4,
+            law=LawChoice("tanh", {"gain": 2.0}),
+            radius=10.0,
+        ).sized()
+        found = assumption(design_report(scenario), "5")
+        assert found["status"] == "holds"
+        assert "log cosh" in found["why"]
+        assert "inputs at their limits included" in found["why"]
+        simulator = scenario.build(law=make_law(scenario.law), observe="oracle")
+        simulator.reset(x0=[5.0, 6.0, 6.0, 6.0, -10.0])
+        edges = np.array(star.edges)
+        spreads, sums = [], []
+        for _ in range(400):
+            x = simulator.x
+            spreads.append(((x - x.mean(axis=1, keepdims=True)) ** 2).sum(axis=1))
+            sums.append(np.log(np.cosh(x[:, edges[:, 0]] - x[:, edges[:, 1]])).sum(axis=1))
+            simulator.step(0.01)
+        assert (np.diff(spreads, axis=0) > 1e-6).any()  # what was said to decrease once
+        assert (np.diff(sums, axis=0) <= 1e-12).all()
+
+    def test_a_disturbance_that_vanishes_at_agreement_says_nothing_against_it(self):
+        """Nor does one of states that positions don't follow; so nothing is claimed."""
+        for disturbance in (Coupling(0.5), Drizzle(0.2)):
+            found = assumption(design_report(path_of(disturbance=disturbance)), "5")
+            assert found["status"] == "not known"
+            assert "vanishes as agents meet, or is your own" in found["why"]
+        heading = Sinusoid((0.0, 0.0, 0.3))
+        bound = Exponential(10.0, 0.1, 5.0)
+        found = assumption(
+            design_report(path_of(models=(Unicycle(),) * 4, disturbance=heading, delta=bound, theta=None)), "5"
+        )
+        assert found["status"] == "not known"
+        assert assumption(design_report(path_of(disturbance=Sum())), "5")["status"] == "holds"
+        assert assumption(design_report(path_of(disturbance=Sum())), "1-iii")["why"] == "w = 0"
+
+    def test_the_gain_that_would_do_near_agreement_is_told(self):
+        """lambda_2 of the paper's task graph, with the law's own gain and where a file leaves it out."""
+        calm = paper().replace(disturbance=None)
+        enough = 1.0 / nx.algebraic_connectivity(calm.task)
+        assert f"= {enough:.4g} 1/s (here k_c = 2)" in assumption(design_report(calm), "5")["why"]
+        without = assumption(design_report(calm.replace(law=LawChoice("tanh"))), "5")["why"]
+        assert f"= {enough:.4g} 1/s; far" in without
+
+    def test_unbounded_g_is_bounded_in_time_only_if_the_law_makes_it_so(self):
+        free = (SingleIntegrator(input_limit=np.inf),) * 2 + (SingleIntegrator(input_limit=4.0),) * 2
+        found = assumption(design_report(path_of(models=free)), "2")
+        assert found["status"] == "not known"
+        assert found["why"].startswith(
+            "(i) g is bounded for 2 of 4 agents, |g| <= 4 in every component; (ii) for the 4"
+        )
+        assert assumption(design_report(path_of()), "2")["status"] == "holds"
+
+    def test_gusts_are_continuous_and_not_said_to_be_smooth(self):
+        why = assumption(design_report(path_of(disturbance=Gust(0.2))), "1-iii")["why"]
+        assert why == "|w| <= 0.2 in every component, as declared by Gust, all continuous"
+
+    def test_an_agent_alone_is_at_its_goal(self):
+        alone = path_of(1, delta=Exponential(1.0, 1.0, 1.0))
+        assert assumption(design_report(alone), "5")["status"] == "holds"
 
     def test_locally_lipschitz_drift_is_told(self):
         why = assumption(design_report(mixed_fleet()), "1-i")["why"]

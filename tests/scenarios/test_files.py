@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents import LAWS, make_law
-from khop_env.observers import Exponential, TargetObservers
+from khop_env.observers import DesignError, Exponential, TargetObservers
 from khop_env.physics import (
     DISTURBANCES,
     MODELS,
@@ -206,7 +206,7 @@ REFUSALS = [  # (what is replaced, by what, the key named, what else the message
     ("k = 2", "k =", "not a TOML file", ["line 3"]),
     ("initial = 10.0", "initial = 0.01", "delta", ["0 < final <= initial", "initial=0.01"]),
     ("initial = 10.0", "initial = [1, 2]", "delta.initial", ["expected a number"]),
-    ("initial = 10.0", "intial = 10.0", "delta.initial", ["missing; expected a number; is 'intial' meant for it?"]),
+    ("initial = 10.0", "intial = 10.0", "delta.initial", ["missing; expected a number or \"auto\"; is 'intial' m"]),
     ("rate = 5\n", "rate = 5\nslope = 1\n", "theta.slope", ["unknown key"]),
     ("[delta]", "[delta.integrater]", "delta.integrater", ["did you mean 'integrator'?"]),
     ("[delta]\ninitial = 10.0", "[delta.integrator]\ninitial = [1, 2, 3]", "delta.integrator.initial", ["got 3 num"]),
@@ -229,6 +229,146 @@ def test_refusals(old, new, key, said, tmp_path):
     assert message.startswith(f"{tmp_path / 'mine.toml'}: {key}")
     for part in said:
         assert part in message
+
+
+def wrong(text: str, tmp_path) -> list[str]:
+    """The mistakes that a message names, without the file."""
+    with pytest.raises(ScenarioFileError) as caught:
+        read(text, tmp_path, laws=LAWS)
+    first, *more = str(caught.value).split("\n")
+    place = f"{tmp_path / 'mine.toml'}: "
+    assert first.startswith(place)
+    if not more:
+        return [first.removeprefix(place)]
+    assert first == f"{place}{len(more)} mistakes:"
+    return [line.removeprefix("  ") for line in more]
+
+
+def test_all_mistakes_of_a_file_are_named_at_once(tmp_path):
+    text = (
+        MINIMAL.replace("k = 2", "k = 1\nduraton = 3")
+        .replace("count = 3", "count = 0\ndim = 7.5\ncolour = 1")
+        .replace("final = 0.1", "final = -0.1")
+        + '[[agents]]\nmodel = "crat"\n[law]\nname = "tan"\n'
+    )
+    found = wrong(text, tmp_path)
+    assert [one.partition(":")[0] for one in found] == [
+        "k", "agents[0].count", "agents[0].dim", "agents[0].colour", "agents[1].model", "law.name", "duraton",
+    ]  # fmt: skip
+    text = MINIMAL.replace("[[0, 1], [1, 2]]", "[[0, 9], [1, 1], [1, 2]]").replace("final = 0.1", "final = -0.1")
+    found = wrong(text.replace("[theta]", NOISE + "amplitude = nan\n" + NOISE + "[theta]\nrat = 1"), tmp_path)
+    assert [one.partition(":")[0] for one in found] == [
+        "communication.edges[0]", "communication.edges[1]", "delta", "theta.rat", "disturbance[0]",
+        "disturbance[1].amplitude",
+    ]  # fmt: skip
+
+
+def test_so_many_mistakes_that_nobody_reads_them_are_cut_short(tmp_path):
+    edges = ", ".join("[0, 9]" for _ in range(50))
+    with pytest.raises(ScenarioFileError, match="50 mistakes:") as caught:
+        read(MINIMAL.replace("[0, 1]", edges), tmp_path)
+    assert str(caught.value).endswith(
+        "communication.edges[19]: got [0, 9], expected two numbers of agents, integers from 0 to 2\n  ... and 30 more"
+    )
+
+
+OUT_OF_RANGE = [  # (what is replaced, by what, the key named, what else the message has to say)
+    ("k = 2", "k = 1" + "0" * 400, "k", "an integer of about 10^400"),
+    ("k = 2", "k = 0x" + "f" * 9000, "k", "an integer of about 10^10837"),
+    ("k = 2", "k = 2\ndt = 1e-300", "dt", "got 1e-300"),
+    ("k = 2", "k = 2\ndt = 1e-20", "scenario 'small'", "dt must be from 1e-09"),
+    ("k = 2", "k = 2\nduration = 1e12", "scenario 'small'", "duration must be from"),
+    ("k = 2", "k = 2\nduration = 1e9\ndt = 1e-9", "scenario 'small'", "1e+18 steps"),
+    ("k = 2", 'k = 2\nrelay = "false"', "relay", "got 'false', expected true or false"),
+    ("count = 3", "count = 1000000000", "agents[0].count", "at most 100000"),
+    ("count = 3", "count = 3\ninput_limit = 1e300", "agents[0].input_limit", "at most 1e+12, and no sm"),
+    ("count = 3", "count = 3\ninput_limit = nan", "agents[0]", "must be positive"),
+    ("count = 3", "count = 3\ninitial_center = [1e200, 0]", "agents[0].initial_center", "got 1e+200"),
+    ("initial = 10.0", "initial = 1e40", "delta.initial", "got 1e+40"),
+    ("initial = 10.0", "initial = inf", "delta", "all finite"),
+    ("rate = 5.0", "rate = 1e-40", "delta.rate", "got 1e-40"),
+    ("[theta]", '[law]\nname = "tanh"\ngain = 10000000000000000000000\n[theta]', "law.gain", "about 10^22"),
+    ("[theta]", '[[disturbance]]\nkind = "noise"\namplitude = 1\ncomponents = 1000000000\n[theta]', "disturbance[0]",
+     "components must be an integer from 1 to 10000"),
+    ("[theta]", '[[disturbance]]\nkind = "gust"\namplitude = 1\nduration = 1e-9\n[theta]', "disturbance[0]", "1e-06"),
+    ('name = "small"', 'name = "../../x"', "a scenario's name", "without '/'; got '../../x'"),
+    ('name = "small"', 'name = "a\\u001b[31mb"', "scenario 'a", "control characters"),
+    ("k = 2", 'k = 2\n"\\u001b[31m" = 1', "'\\x1b[31m'", "unknown key"),
+    ("k = 2", "k = " + "[" * 100_000, "lists or tables are nested", "too deeply"),
+    ("k = 2", "k = " + "[" * 300 + "]" * 300, "k", "expected an integer"),
+    ("k = 2", "k = " + "9" * 5000, "not a TOML file", "Exceeds the limit"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "key", "said"), OUT_OF_RANGE, ids=[new[-40:] for _, new, *_ in OUT_OF_RANGE])
+def test_numbers_and_names_out_of_range_are_refused_by_key(old, new, key, said, tmp_path):
+    (message,) = wrong(MINIMAL.replace(old, new), tmp_path)
+    assert message.startswith(key)
+    assert said in message
+    assert len(message) < 400
+    assert message.isprintable()
+
+
+def test_carts_and_vessels_have_parameters_that_mean_something(tmp_path):
+    for model, line in (
+        ("cart", "damping = nan"), ("cart", "damping = inf"), ("cart", "damping = -1e9"),
+        ("vessel", "mass = [1, inf, 1]"), ("vessel", "linear_drag = [1, inf, 1]"),
+        ("vessel", "quadratic_drag = [nan, 1, 1]"),
+    ):  # fmt: skip
+        text = MINIMAL.replace('model = "integrator"', f'model = "{model}"\n{line}')
+        (message,) = wrong(text, tmp_path)
+        assert message.startswith("agents[0]: ")
+        assert "finite" in message
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path):
+    with (tmp_path / "huge.toml").open("wb") as file:
+        file.truncate(2**33)
+    with pytest.raises(ScenarioFileError, match=r"huge\.toml: has 8589934592 bytes; 67108864 at most"):
+        read_scenario(tmp_path / "huge.toml")
+
+
+class TestInitialValuesByThemselves:
+    def test_are_those_that_the_initial_set_needs(self, tmp_path):
+        text = MINIMAL.replace("initial = 10.0", 'initial = "auto"').replace("initial = 100", 'initial = "auto"')
+        scenario, given = read(text, tmp_path), read(MINIMAL, tmp_path)
+        sized = given.replace(delta=Exponential(0.1, 0.1, 5.0), theta=Exponential(1.0, 1.0, 5.0)).sized()
+        assert (scenario.delta, scenario.theta) == (sized.delta, sized.theta)
+        assert scenario.design.states.feasible_at_start(scenario.initial.radius).max() == pytest.approx(1.0 / 1.25)
+        wide = read(text.replace("count = 3", "count = 3\ninitial_radius = 7"), tmp_path)
+        assert wide.delta.initial == pytest.approx(7.0 * scenario.delta.initial)
+        assert write_scenario(scenario).count("auto") == 1  # in the comment that explains it
+
+    def test_leave_the_others_as_they_are_given(self, tmp_path):
+        text = MINIMAL.replace("initial = 10.0", 'initial = "auto"')
+        assert read(text, tmp_path).theta == Exponential(100.0, 1.0, 5.0)
+        assert read(text, tmp_path).delta != Exponential(0.1, 0.1, 5.0)
+
+    def test_may_be_those_of_one_type(self, tmp_path):
+        text = MINIMAL.replace("count = 3", 'count = 2\n[[agents]]\nmodel = "cart"').replace(
+            "[delta]\ninitial = 10.0\nfinal = 0.1\nrate = 5.0",
+            '[delta.integrator]\ninitial = "auto"\nfinal = [0.1, 0.2]\nrate = 5.0\n'
+            "[delta.cart]\ninitial = 9.0\nfinal = 0.1\nrate = 5.0",
+        )
+        scenario = read(text, tmp_path)
+        assert scenario.delta["cart"] == Exponential(9.0, 0.1, 5.0)
+        assert [one.final for one in scenario.delta["integrator"]] == [0.1, 0.2]
+        assert all(one.initial == pytest.approx(1.25) for one in scenario.delta["integrator"])
+
+    def test_are_refused_where_nothing_bounds_g(self, tmp_path):
+        text = MINIMAL.replace("count = 3", "count = 3\ninput_limit = inf").replace("initial = 100", 'initial = "auto"')
+        (message,) = wrong(text, tmp_path)
+        assert message.startswith("theta.initial: got \"auto\", but the inputs of 'integrator_0' have no limit")
+
+    def test_any_other_word_is_refused(self, tmp_path):
+        (message,) = wrong(MINIMAL.replace("initial = 10.0", 'initial = "automatic"'), tmp_path)
+        assert message == "delta.initial: got 'automatic', expected a number or \"auto\""
+
+    def test_a_design_that_is_impossible_is_left_to_those_who_ask_for_it(self, tmp_path):
+        text = MINIMAL.replace("initial = 10.0", 'initial = "auto"')
+        scenario = read(text[: text.index("[theta]")], tmp_path)
+        with pytest.raises(DesignError, match="theta is missing"):
+            scenario.build()
 
 
 def test_a_type_without_a_bound_is_refused(tmp_path):

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from agents import make_law
-from khop_env.observers import Exponential
+from khop_env.observers import Exponential, TargetObservers
 from khop_env.physics import DriftingIntegrator, Sum, random_geometric_graph
-from khop_env.scenarios import mixed_fleet, paper, random_geometric
+from khop_env.results import design_report
+from khop_env.scenarios import convoy, mixed_fleet, paper, random_geometric
 from khop_env.scenarios.files import write_scenario
 
 
@@ -15,6 +16,11 @@ def spread(simulator):
     """|Pi p| of the positions."""
     p = simulator.fleet.positions(simulator.x)[0]
     return np.linalg.norm(p - p.mean(axis=0))
+
+
+@pytest.mark.parametrize("make", [convoy, mixed_fleet, paper, random_geometric])
+def test_scenarios_are_functions_of_their_package(make):
+    assert make().name.partition(":")[0] == make.__name__
 
 
 def test_paper_has_the_published_numbers():
@@ -52,6 +58,42 @@ def test_estimates_lead_the_team_together_and_keep_their_bounds(factory):
         assert np.all(ratio < 1.0)
 
 
+def test_attributes_of_nodes_and_edges_change_nothing():
+    """Laws and observers count edges; so do Theorem 4's gain and the assumptions."""
+    scenario = paper().replace(disturbance=None)
+    graphs = {name: getattr(scenario, name).copy() for name in ("communication", "task")}
+    for graph in graphs.values():
+        nx.set_edge_attributes(graph, 100.0, "weight")
+        nx.set_node_attributes(graph, 7.0, "weight")
+        graph.graph["name"] = "heavy"
+    heavy = scenario.replace(**graphs)
+    law = make_law(scenario.law)
+    assert law.set_iss_gain(heavy) == law.set_iss_gain(scenario)
+    assert law.set_iss_gain(scenario).coupling == pytest.approx(2.0 * nx.algebraic_connectivity(scenario.task))
+    assert design_report(heavy) == design_report(scenario)
+    for name in graphs:
+        assert not any(attributes for *_, attributes in getattr(heavy, name).edges(data=True))
+        assert not any(attributes for _, attributes in getattr(heavy, name).nodes(data=True))
+
+
+@pytest.mark.parametrize("name", ["communication", "task"])
+def test_graphs_that_say_more_than_an_edge_can_are_refused(name):
+    loop = nx.Graph(getattr(paper(), name))
+    loop.add_edge(3, 3)
+    for graph, message in (
+        (loop, r"own neighbour; remove the self-loops \(3, 3\)"),
+        (nx.MultiGraph(loop), "got a MultiGraph"),
+        (nx.DiGraph(loop), "got a DiGraph"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} graph: .*{message}"):
+            paper().replace(**{name: graph})
+
+
+def test_a_scenarios_graphs_cannot_be_changed_behind_its_design():
+    with pytest.raises(nx.NetworkXError, match="Frozen graph"):
+        paper().task.add_edge(0, 5)
+
+
 def test_mixed_fleet_is_mixed():
     scenario = mixed_fleet()
     assert len(scenario.fleet) >= 10
@@ -87,9 +129,30 @@ def test_every_member_of_the_family_is_feasible(agents, k):
         assert np.all(simulator.extremes.normalized < 1.0)
 
 
-def test_random_geometric_refuses_three_agents():
-    with pytest.raises(ValueError, match="at least 4 agents; got agents=3"):
-        random_geometric(agents=3)
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"agents": 3}, "agents must be at least 4; got agents=3"),
+        ({"agents": 99999999999999999999}, "agents must be at most 100000; got agents=99999999999999999999"),
+        ({"agents": 10.0}, "agents must be an integer; got 10.0"),
+        ({"agents": True}, "agents must be an integer; got True"),
+        ({"k": 1}, "k must be at least 2; got k=1"),
+        ({"k": 2.5}, "k must be an integer; got 2.5"),
+        ({"seed": -1}, "seed must be at least 0; got seed=-1"),
+        ({"seed": 10**30}, "seed must be at most"),
+        ({"rate": np.nan}, "needs a positive, finite rate; got rate=nan"),
+    ],
+)
+def test_random_geometric_refuses_nonsense_before_it_draws_anything(given, message):
+    with pytest.raises(ValueError, match=message):
+        random_geometric(**given)
+
+
+def test_more_environments_than_memory_holds_are_refused():
+    with pytest.raises(
+        ValueError, match=r"1000000000 environments of 'paper' have .*e\+.* states and estimates; take 5"
+    ):
+        paper().build(num_envs=10**9)
 
 
 def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
@@ -109,6 +172,21 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
         ({"radius": -1.0}, "radius must not be negative"),
         ({"dt": 0.0}, "dt must be positive"),
         ({"dt": np.inf}, "dt must be positive and finite; got inf"),
+        ({"dt": 1e-300}, "dt must be from 1e-09 to 1e.09 s; got 1e-300"),
+        ({"duration": 1e300}, "duration must be from .* got 1e.300"),
+        ({"duration": 10**400}, "duration must be from"),
+        ({"duration": 1e6, "dt": 1e-6}, r"1e\+12 steps, and 1e\+08 are the most; take dt of 0.01 s or more"),
+        ({"relay": "false"}, "relay must be True or False; got 'false'"),
+        (
+            {"observers": (TargetObservers(drift="no"),) * 8},
+            "the drift of its observers must be True or False; got 'no'",
+        ),
+        ({"order": 3}, "order must be 1 or 2; got 3"),
+        ({"name": "../../x"}, "name names a folder, too: 1 to 200 characters without '/'; got '../../x'"),
+        ({"name": ""}, "1 to 200 characters"),
+        ({"name": "n" * 201}, "1 to 200 characters"),
+        ({"name": "a\x1b[31mb"}, r"name must not have control characters; got 'a\\x1b\[31mb'"),
+        ({"description": "a\x07"}, "description must not have control characters"),
         ({"duration": np.nan}, "duration must be positive and finite; got nan"),
         ({"k": 2.5}, "k must be an integer, a number of hops; got 2.5"),
         ({"communication": nx.path_graph(7)}, "missing 7"),

@@ -141,8 +141,23 @@ def test_what_a_simulator_is_built_from_is_checked():
         Simulator(design, InitialSet(np.zeros(6), np.full(6, 200.0)))
     with pytest.raises(ValueError, match="order 1 and 2; got order=3"):
         Proximal(order=3)
-    with pytest.raises(ValueError, match="threads must be at least 1; got 0"):
-        Proximal(threads=0)
+    for threads in (0, 10**6, 2.5, True):
+        with pytest.raises(ValueError, match=f"threads must be an integer from 1 to 256; got {threads}"):
+            Proximal(threads=threads)
+
+
+@pytest.mark.parametrize(
+    ("center", "radius", "message"),
+    [
+        (np.zeros(6), np.full(6, -1.0), "radius must not be negative; got -1 for component 0"),
+        (np.zeros(6), np.full(6, np.nan), "center and radius must be finite"),
+        (np.full(6, np.inf), np.ones(6), "center and radius must be finite"),
+        (np.zeros(6), np.ones(5), r"\(n,\) each"),
+    ],
+)
+def test_initial_sets_are_boxes(center, radius, message):
+    with pytest.raises(ValueError, match=message):
+        InitialSet(center, radius)
 
 
 def test_a_law_that_returns_a_wrong_shape_is_named():
