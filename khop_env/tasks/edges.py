@@ -145,8 +145,8 @@ def require_positive(name: str, value: object) -> None:
     Raises:
         ValueError: naming the argument and the value.
     """
-    if not isinstance(value, NUMBER) or not 0.0 < value < math.inf:
-        raise ValueError(f"{name} must be a positive, finite number; got {value!r}")
+    if not isinstance(value, NUMBER) or not 0.0 < value <= 1e30:  # observations are float32, which ends at 3e38
+        raise ValueError(f"{name} must be a positive, finite number of at most 1e30; got {value!r}")
 
 
 def axis_names(dim: int) -> list[str]:

@@ -211,8 +211,12 @@ def test_ctrl_c_on_the_command_line(tmp_path, arguments, calls, printed, said):
 def test_a_killed_worker_on_the_command_line(monkeypatch):
     """One line, status 2, and what was played."""
 
+    calls = []
+
     def kill(*_):
-        os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+        calls.append(None)
+        if len(calls) == 60:  # by then both workers have begun, and the first chunk of episodes has come
+            os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
 
     monkeypatch.setattr("khop_env.commands.evaluate.Progress.__call__", kill)
     result = CliRunner().invoke(app, [*EVALUATE, "--workers", "2"])

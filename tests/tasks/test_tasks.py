@@ -135,8 +135,8 @@ def test_points_and_spacing_are_the_users_to_choose():
             r"points must be finite, of shape \(agents, position axes\) = \(8, 2\).*\(8, 3\)",
         ),
         ({"points": np.full((8, 2), np.nan)}, "points must be finite"),
-        ({"spacing": 0.0}, "spacing must be a positive, finite number; got 0.0"),
-        ({"spacing": math.inf}, "spacing must be a positive, finite number; got inf"),
+        ({"spacing": 0.0}, "spacing must be a positive, finite number of at most 1e30; got 0.0"),
+        ({"spacing": math.inf}, "spacing must be a positive, finite number of at most 1e30; got inf"),
     ],
 )
 def test_formations_that_are_none_are_refused(arguments, message):
@@ -253,7 +253,7 @@ def test_leaders_stay_near_in_spite_of_drift_and_disturbance():
         ({"follow": {"drifter_0": "drifter_3"}}, "follow: 'drifter_0' isn't a follower"),
         ({"follow": {"drifter_1": "drifter_2"}}, "follow: 'drifter_2' isn't a leader"),
         ({"follow": {"drifter_1": "drifter_6"}}, "'drifter_1' knows nothing of 'drifter_6', which is more than k hops"),
-        ({"leader_speed": 0.0}, "leader_speed must be a positive, finite number; got 0.0"),
+        ({"leader_speed": 0.0}, "leader_speed must be a positive, finite number of at most 1e30; got 0.0"),
         ({"spacing": -1.0}, "spacing must be finite and not negative; got -1.0"),
     ],
 )
