@@ -167,7 +167,10 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"task": nx.Graph([(0, 7), *((i, i + 1) for i in range(7))])}, r"nobody could act.*\(0, 7\) at distance 5"),
+        (
+            {"task": nx.Graph([(0, 7), *((i, i + 1) for i in range(7))])},
+            r"know nothing of each other.*\(0, 7\) at distance 5",
+        ),
         ({"radius": np.ones(5)}, "radius must be one finite number or 16"),
         ({"radius": -1.0}, "radius must not be negative"),
         ({"dt": 0.0}, "dt must be positive"),
