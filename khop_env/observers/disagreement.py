@@ -39,7 +39,7 @@ def disagreement(pairs: PairArrays, estimate: FloatArray, source: FloatArray, ou
     Args:
         pairs: `PairLayout.arrays`.
         estimate: (P, B) the observers' estimates.
-        source: (n, B) the fleet's true vector, of which an observer uses what its neighbours relay.
+        source: (n, B) the fleet's true vector; an observer uses only the parts that its neighbours relay.
         out: (P, B) xi, written.
     """
     batch = estimate.shape[1]
@@ -50,7 +50,7 @@ def disagreement(pairs: PairArrays, estimate: FloatArray, source: FloatArray, ou
             d, h = pairs.diagonal[pair + a], pairs.relay[pair + a]
             for c in range(n):
                 column = offset + a * n + c
-                if h == 0.0:  # no message carries the state to this observer: it must not even be read
+                if h == 0.0:  # no neighbour relays the state to this observer, so it isn't read
                     for env in range(batch):
                         out[column, env] = d * estimate[column, env]
                 else:

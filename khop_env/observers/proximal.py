@@ -1,4 +1,4 @@
-"""The paper's observers by a coupled proximal step: implicit-explicit Runge-Kutta, inside the funnels at any step."""
+"""The paper's observers by a coupled proximal step: implicit-explicit Runge-Kutta, inside the funnels for any step."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ MOST_THREADS = 256
 
 
 class Proximal(FunnelObservers):
-    """The barrier implicit, everything else explicit: |e| < 1 at every grid point, whatever the step.
+    """Proximal step: the barrier is implicit, everything else explicit; |e| < 1 at every grid point for any step.
 
     Its memory adds "eps" (P, B) and "nu" (Q, B): the transformed disagreements, from which the next solve starts.
 
     Args:
         order: 1 or 2.
-        threads: environments (or targets, in a small batch) are solved by this many threads; results don't depend on
-            it.
+        threads: number of threads that share the environments (or targets, in a small batch); results don't depend
+            on it.
 
     Attributes:
         evaluations: of the barrier, in all steps so far.
@@ -75,7 +75,7 @@ class Proximal(FunnelObservers):
         self._implicit = [np.array(row) for row in self._tableau.implicit]
 
     def prepare(self, design: ObserverDesign, num_envs: int) -> None:
-        """Allocate what steps of `design` need in `num_envs` environments."""
+        """Allocate the buffers for steps of `design` in `num_envs` environments."""
         super().prepare(design, num_envs)
         stages = range(len(self._tableau.nodes))
         pairs, input_pairs = design.states.layout.size, design.inputs.layout.size
@@ -122,7 +122,11 @@ class Proximal(FunnelObservers):
     def _account(
         self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray
     ) -> None:
-        """Count the work of a solve, and say why it failed if it did."""
+        """Count the work of a solve.
+
+        Raises:
+            SolveError: if the solve failed, with the reason.
+        """
         for evaluations, env, target in found:
             self.evaluations += evaluations
             if env >= 0:

@@ -34,7 +34,7 @@ from khop_env.observers.layout import FloatArray, IntArray, PairArrays
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
 MAX_ITERATIONS = 200
 LANES = 64  # scalar problems solved side by side: enough to fill vector registers, few enough to stay in cache
-_JUMP = 0.25  # in eps: beyond it a warm start isn't worth more than none
+_JUMP = 0.25  # in eps: beyond it a warm start is no better than a new start
 _LONG_STEP = 1.0  # in eps: beyond it exp is not nearly linear
 
 
@@ -66,7 +66,7 @@ class _Work(NamedTuple):
 
 @inlined
 def _barrier(eps: float) -> tuple[float, float, float]:
-    """E = tanh(eps / 2), z = phi'(e) = eps (1 + cosh eps), and d eps / dz, of which de/dz = de/deps d eps/dz."""
+    """(e, z, d eps / dz) with e = tanh(eps / 2) and z = phi'(e) = eps (1 + cosh eps); de/dz = de/deps d eps/dz."""
     a = abs(eps)
     growth = expm1(a)
     half = 1.0 / (growth + 2.0)
@@ -165,7 +165,7 @@ def _newton_step(
 
 @compiled
 def _land(eta: int, lanes: int, active: FloatArray, work: _Work) -> None:
-    """After long steps, take eps from the impulse that Newton's method has arrived at: it isn't linear in it."""
+    """After long steps, compute eps from the impulse z that Newton's method has reached: eps isn't linear in z."""
     z, gain, dz, answer, u = work.z, work.gain, work.dz, work.answer, work.eps
     for a in range(eta):
         for lane in range(lanes):
@@ -186,7 +186,7 @@ def _start_anew(
     lack: FloatArray,
     stiffness: FloatArray,
 ) -> bool:
-    """Replace a warm start that a jump of the source has made useless; say whether there was one.
+    """Replace a warm start that a jump of the source has made useless; return True if one was replaced.
 
     Since M 1 = h, the equations of all observers add up to sum e + s sum h z = sum b. Where Newton's step for a common
     impulse would be long, every observer starts from the one common impulse that meets the sum.
@@ -204,7 +204,7 @@ def _start_anew(
         for lane in range(lanes):
             total[0, lane] += b[a, lane]
             lack[lane] += b[a, lane] - e[a, lane] - scale[lane] * h * z[a, lane]
-            # de/dz + s h, over deps/dz: what a unit of eps is worth
+            # (de/dz + s h) / (deps/dz): change of the sum per unit of eps
             stiffness[lane] += 0.5 * (1.0 - e[a, lane] * e[a, lane]) + scale[lane] * h / gain[a, lane]
     far = 0.0
     for lane in range(lanes):
@@ -324,13 +324,13 @@ def solve(
                 for lane in range(lanes):
                     worst[lane] = 0.0
                     poison[lane] = 0.0
-                # a lane that is done must not move again, or its result would depend on its company
+                # a lane that has converged doesn't move again, or its result would depend on the other lanes
                 for a in range(eta):
                     for lane in range(lanes):
                         on = active[lane] > 0.0
                         step = dz[a, lane] * gain[a, lane] if on else 0.0
                         worst[lane] = max(abs(step), worst[lane])
-                        poison[lane] += 0.0 * step  # 0, or NaN for good, which a maximum may lose
+                        poison[lane] += 0.0 * step  # 0, or NaN once and for all, which a maximum may lose
                         answer[a, lane] = z[a, lane] + dz[a, lane] if on else answer[a, lane]
                         u[a, lane] += step
                 moving = False

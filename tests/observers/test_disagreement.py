@@ -116,7 +116,7 @@ def test_disagreement_is_the_sum_over_neighbors_and_m_times_the_error(drawn, see
 
 @given(system=systems())
 def test_simulator_reports_disagreements_and_errors_of_both_observers(system):
-    """xi = M x_tilde and mu = M g_tilde (the equations of Sections III and V) in what `Simulator` tells its user."""
+    """xi = M x_tilde and mu = M g_tilde (the equations of Sections III and V) in the results of `Simulator`."""
     simulator = system.simulator(Proximal(), num_envs=2)
     simulator.step(0.05)
     for funnels, error, difference, estimates, truth in (
