@@ -1,7 +1,7 @@
-"""The plant under its law and disturbance, and its one stepper: what `observers.Plant` asks for.
+"""The plant under its law and disturbance, and its one stepper: implements `observers.Plant`.
 
-Arrays are (columns, B) here, batch last and contiguous, because compiled loops run along the batch. What models, laws,
-disturbances and users get are views (B, ...) of them.
+Arrays are (columns, B) here, batch last and contiguous, because compiled loops run along the batch. Models, laws,
+disturbances and users get views (B, ...) of them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class FleetPlant:
         num_envs: number of environments B.
         disturbance: an attached disturbance (`physics.Disturbance.attach`), or None.
         law: the feedback law, or None for inputs that are held.
-        views: what the law sees; needed with a law.
+        views: builds the law's view; needed with a law.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class FleetPlant:
 
 
 def require_finite(x: FloatArray, fleet: Fleet) -> None:
-    """Refuse states (n, B) that became NaN or infinite, also those of agents that nobody estimates.
+    """Refuse states (n, B) that became NaN or infinite, also those of agents without observers.
 
     Raises:
         SolveError: naming the environment, agent and component.

@@ -237,7 +237,7 @@ def test_bad_resets_are_refused_and_change_nothing():
 @pytest.mark.parametrize(
     ("copies", "message"),
     [
-        ([0, 3], r"must be different ones among 0 to 2; got \[0, 3\]"),
+        ([0, 3], r"must be different indices from 0 to 2; got \[0, 3\]"),
         ([-1], r"among 0 to 2; got \[-1\]"),
         ([1, 1], r"different ones .* got \[1, 1\]"),
         (np.array([True, False, True]), r"not a mask: give np.flatnonzero\(mask\)"),
