@@ -1,4 +1,4 @@
-"""From the simulator's arrays to flat float32 vectors: a table of columns, and the compiled loop that walks it."""
+"""From the simulator's arrays to flat float32 vectors: a table of columns, and the compiled loop that reads it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from khop_env.observers import FloatArray, IntArray
 # sources of a column's value: none, states, estimates, their guaranteed bounds, inputs, the task's own rows
 CONSTANT, STATE, STATE_COS, STATE_SIN, STATE_RELATIVE = range(5)
 ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, BOUND, INPUT, TASK = range(5, 12)
-_TILE = 32  # environments: a column's values of so many are computed before they are written
+_TILE = 32  # number of environments whose values of a column are computed before they are written
 
 
 @dataclass(frozen=True)
 class Column:
-    """A field and where its value comes from.
+    """A field and the source of its value.
 
     Attributes:
         field: name, unit and bounds.
@@ -63,7 +63,7 @@ class Sources(NamedTuple):
 
 
 class _LiveColumns(NamedTuple):
-    """The columns that aren't constant, an entry each."""
+    """Arrays over the columns that aren't constant, with the attributes of `Column`."""
 
     column: IntArray
     kind: IntArray
@@ -106,7 +106,7 @@ class Readout:
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
     def __call__(self, sources: Sources, clipped: IntArray) -> Float32Array:
-        """Vectors (B, columns) in new memory; adds to `clipped` (B, owners) how many values had to be clipped."""
+        """Vectors (B, columns) in new memory; adds the number of clipped values to `clipped` (B, owners)."""
         out = np.empty((sources.x.shape[1], len(self.template)), np.float32)
         fill(self._live, self.template, sources, out, clipped)
         return out

@@ -103,7 +103,7 @@ def test_estimates_show_in_no_other_mode(environment, name, observe):
 
 @every
 def test_inputs_draws_and_solver_states_show_to_nobody_else(environment, name):
-    """What others do, the disturbance and the observers' inner states stay hidden; a lagging input is its owner's."""
+    """Other agents' inputs, the disturbance and the observers' inner states aren't observed; own inputs are."""
     env, ids = in_mid_episode(environment, name, actuator="lag")
     fleet = env.batched.fleet
 
