@@ -185,7 +185,7 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
             "the drift of its observers must be True or False; got 'no'",
         ),
         ({"order": 3}, "order must be 1 or 2; got 3"),
-        ({"name": "../../x"}, "name names a folder, too: 1 to 200 characters without '/'; got '../../x'"),
+        ({"name": "../../x"}, "name is also a folder's: 1 to 200 characters without '/'; got '../../x'"),
         ({"name": ""}, "1 to 200 characters"),
         ({"name": "n" * 201}, "1 to 200 characters"),
         ({"name": "a\x1b[31mb"}, r"name must not have control characters; got 'a\\x1b\[31mb'"),
