@@ -1,4 +1,4 @@
-"""Python objects by name, as a user writes them where the command line takes one: `my_module:make_env`."""
+"""Python objects by name, for arguments of the command line: `my_module:make_env`."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def load_object(name: str) -> Any:
         load_object("path/to/my_file.py:Configuration.make")
         load_object("mpe2.simple_spread_v3")
 
-    Modules are looked for among what is installed and in the working directory. A file becomes a module of its own
-    name, and its folder is searched too, so that it can import what lies beside it and its objects can be pickled.
+    Modules are searched among installed ones and in the working directory. A file becomes a module of its own name, and
+    its folder is searched too, so that it can import files beside it and its objects can be pickled.
 
     Args:
         name: "module:attribute", "file.py:attribute", or without the attribute.
@@ -37,7 +37,7 @@ def load_object(name: str) -> Any:
     found: Any = _file(source) if source.endswith(".py") else _module(source)
     for part in filter(None, attribute.split(".")):
         if not hasattr(found, part):
-            known = [one for one in vars(found) if not one.startswith("_")] if hasattr(found, "__dict__") else []
+            known = [key for key in vars(found) if not key.startswith("_")] if hasattr(found, "__dict__") else []
             listed = ", ".join(known[-_LISTED:]) + (", ..." if len(known) > _LISTED else "")
             owner = source if isinstance(found, ModuleType) else f"{source}: {getattr(found, '__name__', found)}"
             raise ValueError(f"{owner} has no {part!r}; it has {listed or 'no public names'}")
@@ -46,7 +46,7 @@ def load_object(name: str) -> Any:
 
 
 def is_object_name(name: str) -> bool:
-    """Whether a text is meant for `load_object`: "module:attribute", or a file that ends in .py."""
+    """True if a text is a name for `load_object`: "module:attribute", or a file that ends in .py."""
     source, _, attribute = name.rpartition(":")
     if name.endswith(".py") or source.endswith(".py"):
         return True
@@ -59,7 +59,7 @@ def described(error: BaseException, file: str = "") -> str:
 
     Args:
         error: the exception.
-        file: how the path of a file ends, whose last line that was under way is named instead of the last of all.
+        file: end of the path of a file; the last frame in it is named instead of the last frame of all.
     """
     text = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError) and error.filename is not None:
@@ -120,7 +120,7 @@ def _file(text: str) -> ModuleType:
 
 
 def _search(folder: Path) -> None:
-    """Let imports find what lies in a folder, after everything that is installed."""
+    """Add a folder to the search path of imports, after all installed packages."""
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
 
