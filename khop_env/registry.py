@@ -86,7 +86,7 @@ def make_batched(
 
     Args:
         environment: one of `environments()`, or a task of your own.
-        scenario: a scenario, or what `scenario` takes; the task's default if left out.
+        scenario: a scenario, or an argument of `scenario`; the task's default if left out.
         num_envs: number of environments B.
         arguments: of `Settings`, and of the task unless it is an object, by name.
 
@@ -127,7 +127,7 @@ def make(
 
     Args:
         environment: one of `environments()`, or a task of your own.
-        scenario: a scenario, or what `scenario` takes; the task's default if left out.
+        scenario: a scenario, or an argument of `scenario`; the task's default if left out.
         render_mode: None, "human" or "rgb_array".
         arguments: as for `make_batched`.
 

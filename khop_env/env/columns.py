@@ -42,7 +42,7 @@ class ObservationColumns:
         agents: the agents that observe, by index.
         observe: content of the slots of k-hop targets: their estimates, their true states, or zeros.
         bounds: whether slots hold the guaranteed bound on the estimate's error.
-        uniform: the same columns for every agent, padded; or exactly what each agent has.
+        uniform: True for the same columns for every agent, padded; False for each agent's own columns.
         inputs: whether an agent observes its input in force, which an actuator may make a state.
 
     Attributes:

@@ -91,7 +91,7 @@ class Readout:
         self.template = np.array([column.value for column in columns], np.float32)
         live = [q for q, column in enumerate(columns) if column.kind != CONSTANT]
         kinds, rows = [columns[q].kind for q in live], [columns[q].row for q in live]
-        # float32 bounds, so that what is clipped to them in float64 is inside them as float32, too
+        # float32 bounds, so that values clipped to them in float64 are inside them as float32, too
         bounds = np.array([columns[q].bounds for q in live], np.float32).reshape(-1, 2).astype(float)
         self._live = _LiveColumns(
             np.array(live, np.int64),

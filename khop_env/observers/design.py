@@ -124,7 +124,7 @@ class ObserverDesign:
         delta: bound on the state estimation errors: one performance function for all, or one `Bound` per target.
         theta: likewise for the input estimation errors; may be None where no target has an input observer.
         relay: whether agents relay their neighbours' states (Assumption 4); without it 1-hop neighbours are estimated
-            too, from what the target itself sends (the paper's remarks).
+            too, from the target's own messages (the paper's remarks).
         targets: per agent the options of its observers; `TargetObservers()` by default, without the input observer
             where the input map depends on the state.
 

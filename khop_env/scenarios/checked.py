@@ -63,7 +63,7 @@ class CheckedTable:
         self.mistakes.append(f"{name}: {why}" if name else why)
 
     def refuse(self, key: str, why: str) -> NoReturn:
-        """Note a mistake, and stop reading what depends on it."""
+        """Note a mistake, and stop reading values that depend on it."""
         self.note(key, why)
         raise NotedError
 

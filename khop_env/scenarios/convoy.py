@@ -17,8 +17,8 @@ def convoy() -> Scenario:
 
     The paper's unstable drift and communication tree with k = 3. Five agents have inputs up to 3 m/s and three, made to
     be leaders, up to 6 m/s: at their default speed of 3 m/s (rms) their followers, all two hops away, saturate now and
-    then. The bounds fall at 15 1/s instead of the paper's 5 1/s, since what separates acting on estimates from acting
-    on the truth is the opening transient. There are no input observers: a policy's inputs jump, but they are bounded,
+    then. The bounds fall at 15 1/s instead of the paper's 5 1/s, since acting on estimates differs from acting on true
+    states in the initial transient. There are no input observers: a policy's inputs jump, but they are bounded,
     which is enough for the state observer (the paper's remark on omitting it). All numbers are our choice.
     """
     task = nx.Graph()

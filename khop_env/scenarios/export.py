@@ -203,7 +203,7 @@ def _lines(rows: Sequence[Any], per_line: int) -> Array:
 
 
 def _plain(value: Any) -> Any:
-    """NumPy numbers and tuples as what TOML has: numbers, lists, tables."""
+    """NumPy numbers and tuples as TOML types: numbers, lists, tables."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):

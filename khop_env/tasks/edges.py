@@ -1,4 +1,4 @@
-"""Tasks along edges: agent i wants p_j - p_i = d_ij for each of its edges (i, j)."""
+"""Tasks along edges: agent i is to reach p_j - p_i = d_ij for each of its edges (i, j)."""
 
 from __future__ import annotations
 

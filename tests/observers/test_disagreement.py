@@ -71,7 +71,7 @@ def test_lemma_1_the_matrices_are_positive_definite(drawn):
 
 
 def test_lemma_1_needs_a_connected_graph():
-    """Two agents that hear only each other have no path to the target: M would be singular; they aren't observers."""
+    """Two agents without other neighbours have no path to the target: M would be singular; they are no observers."""
     graph = nx.Graph([(0, 1), (1, 2), (3, 4)])
     layout = PairLayout.build(Links.of(graph), k_hop_neighbors(graph, 4), [1] * 5, range(5), relay=True)
     assert layout.target.tolist() == [0, 2]

@@ -41,8 +41,8 @@ def test_paper_has_the_published_numbers():
 
 def test_papers_task_mostly_joins_agents_out_of_earshot():
     scenario = paper()
-    unheard = [edge for edge in scenario.task.edges if not scenario.communication.has_edge(*edge)]
-    assert len(unheard) > len(scenario.task.edges) / 2
+    to_targets = [edge for edge in scenario.task.edges if not scenario.communication.has_edge(*edge)]
+    assert len(to_targets) > len(scenario.task.edges) / 2
     assert nx.is_connected(scenario.task)
 
 

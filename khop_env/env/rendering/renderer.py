@@ -162,7 +162,7 @@ class Renderer:
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
             task_error: in m, if there is one to show.
-            decorate: draws what a task adds, below the agents.
+            decorate: draws the task's additions, below the agents.
 
         Returns:
             (H, W, 3) pixels, a fresh array.
@@ -191,7 +191,7 @@ class Renderer:
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
             task_error: in m, if there is one to show.
-            decorate: draws what a task adds, below the agents.
+            decorate: draws the task's additions, below the agents.
 
         Raises:
             ModuleNotFoundError: without pygame-ce.
