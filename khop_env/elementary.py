@@ -136,6 +136,16 @@ def log_ratio(e: float) -> float:
 
 
 @compiled
+def all_finite(values: NDArray[np.float64]) -> bool:
+    """True if all values of a contiguous array are finite."""
+    total = 0.0
+    flat = values.ravel()
+    for q in range(flat.size):
+        total += 0.0 * flat[q]  # 0, or NaN once and for all
+    return total == 0.0
+
+
+@compiled
 def weighted_sum(
     base: NDArray[np.float64],
     weights: NDArray[np.float64],

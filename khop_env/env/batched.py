@@ -284,14 +284,16 @@ class BatchedEnv:
 
     def _observed(self, outcome: Outcome) -> tuple[Float32Array, Infos]:
         observations, clipped = self._observe()
-        extremes, shape = self.simulator.extremes, (self.num_envs, len(self.agents))
-        ratios = {
-            "max_normalized_disagreement": np.maximum(extremes.normalized, extremes.input_normalized),
-            "max_error_to_bound": np.maximum(extremes.relative, extremes.input_relative),
-        }
+        extremes = self.simulator.running_extremes
         return observations, {
             **outcome.infos,
-            **{name: np.broadcast_to(values[:, None], shape).copy() for name, values in ratios.items()},
+            "max_normalized_disagreement": self._for_all(extremes.normalized, extremes.input_normalized),
+            "max_error_to_bound": self._for_all(extremes.relative, extremes.input_relative),
             "clipped_observations": clipped,
             "clipped_actions": self._clipped_actions.copy(),
         }
+
+    def _for_all(self, of_states: FloatArray, of_inputs: FloatArray) -> FloatArray:
+        """(B, N) the larger of two ratios (B,), the same for all agents of an environment."""
+        out = np.empty((self.num_envs, len(self.agents)))
+        return np.maximum(of_states[:, None], of_inputs[:, None], out=out)

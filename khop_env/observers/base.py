@@ -184,15 +184,16 @@ class WidthsNow:
 
     def __init__(self, bank: FunnelBank, num_envs: int) -> None:
         self._bank = bank
-        self._time = np.full(num_envs, np.nan)
+        self._time = b""
         self._values = np.ones((len(bank), num_envs))
 
     def at(self, t: FloatArray) -> FloatArray:
         """(rows, B) widths at the times `t` (B,); overwritten by the next instant's."""
-        if not np.array_equal(t, self._time):
-            self._time.fill(np.nan)  # if the evaluation raises, its partial results aren't used
+        now = t.tobytes()
+        if now != self._time:
+            self._time = b""  # if the evaluation raises, its partial results aren't used
             self._bank.evaluate(t, self._values)
-            self._time[...] = t
+            self._time = now
         return self._values
 
 
@@ -236,7 +237,14 @@ class FunnelObservers:
         """Raise running maxima of |xi| / rho and |x_tilde| / delta, and of the same for inputs, to those of a state."""
         memory = state.memory
         for funnels, widths, estimate, source, normalized, relative in (
-            (self.design.states, self.rho, memory["estimate"], state.x, extremes.normalized, extremes.relative),
+            (
+                self.design.states,
+                self.rho,
+                memory["estimate"],
+                state.x,
+                extremes.normalized,
+                extremes.relative,
+            ),
             (
                 self.design.inputs,
                 self.omega,
@@ -248,4 +256,4 @@ class FunnelObservers:
         ):
             if funnels.layout.size:
                 rho = widths.at(state.t)
-                largest_ratios(funnels.layout.arrays, estimate, source, rho, funnels.gain, normalized, relative)
+                largest_ratios(funnels.layout.packed, estimate, source, rho, funnels.gain, normalized, relative)
