@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from khop_env.extras import how_to_install
+
 
 def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
     """Number and result of each task, as they come; tasks lost with a machine are run again by Ray, three times.
@@ -23,7 +25,7 @@ def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator
     try:
         import ray
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("a Ray cluster needs Ray: pip install 'khop_env[ray]'") from error
+        raise ModuleNotFoundError(f"a Ray cluster needs Ray: {how_to_install('ray')}") from error
 
     started = not ray.is_initialized()
     if started:

@@ -26,6 +26,7 @@ from benchmarks.environments import environment_rows
 from benchmarks.report import Report, reason
 from benchmarks.training import training_rows
 from benchmarks.yardsticks import CompiledPaper, bare_loop
+from khop_env.extras import how_to_install
 from khop_env.observers import FloatArray, Proximal
 from khop_env.observers.solve import solve
 from khop_env.scenarios import Scenario, paper, random_geometric
@@ -128,7 +129,7 @@ def _installed(package: str) -> bool:
 
 
 def _to_install(packages: Sequence[str]) -> str:
-    return f"needs {' and '.join(packages)}: pip install -c constraints.txt -e '.[bench]'"
+    return f"needs {' and '.join(packages)}: {how_to_install('bench')}"
 
 
 def _best(action: Callable[[], object], repeats: int) -> float:

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 import khop_env.tasks
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
+from khop_env.extras import how_to_install
 from khop_env.objects import is_object_name, load_object
 from khop_env.observers import Proximal
 from khop_env.physics import did_you_mean
@@ -198,7 +199,7 @@ def make_sb3_vec(environment: Environment, num_envs: int = 1, **arguments: Any) 
     try:
         from khop_env.env.sb3 import KHopSB3VecEnv
     except ImportError as error:
-        raise ImportError("make_sb3_vec needs Stable-Baselines3: pip install 'khop_env[rl]'") from error
+        raise ImportError(f"make_sb3_vec needs Stable-Baselines3: {how_to_install('rl')}") from error
     return KHopSB3VecEnv(make_batched(environment, num_envs=num_envs, **arguments))
 
 

@@ -148,7 +148,7 @@ def test_without_the_extras_the_rest_is_measured(quick_parts, monkeypatch):
     monkeypatch.setattr(sys, "meta_path", [NotInstalled(), *sys.meta_path])
     lines = []
     report = benchmark(quick=True, progress=lines.append)
-    how = "pip install -c constraints.txt -e '.[bench]'"
+    how = "in a clone of khop_env, pip install -c constraints.txt -e '.[bench]'"
     assert lines[:3] == [
         f"left out: proximal against SciPy's stiff solvers (needs scipy: {how})",
         f"left out: training: PPO, 64 environments of 8 agents (needs stable_baselines3 and torch: {how})",

@@ -251,7 +251,7 @@ class TestRun:
         assert "no agent 8" in refused("run", "paper", "--video", "film.gif", "--observer", "8")
         assert "give --video FILE, too" in refused("run", "paper", "--observer", "1")
         monkeypatch.setitem(sys.modules, "pygame", None)
-        assert "pip install 'khop_env[render]'" in refused("run", "paper", "--video", "film.gif")
+        assert "pip install -c constraints.txt -e '.[render]'" in refused("run", "paper", "--video", "film.gif")
         assert not list(folder.iterdir())
 
     def test_a_file_that_cannot_be_written_is_told_after_the_summary(self, folder):

@@ -272,7 +272,7 @@ def test_without_sb3_its_check_says_how_to_install_it(monkeypatch):
     report = check_environment(partial(consensus_v0.parallel_env, "paper", max_cycles=10), steps=20)
     assert report.ok
     assert report["sb3"].status == "skipped"
-    assert "pip install 'khop_env[rl]'" in report["sb3"].detail
+    assert "pip install -c constraints.txt -e '.[rl]'" in report["sb3"].detail
     assert report["views"].detail == "not compared as an SB3 VecEnv: Stable-Baselines3 isn't installed"
 
 

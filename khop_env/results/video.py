@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.env import BatchedEnv
+from khop_env.extras import how_to_install
 from khop_env.results.metrics import consensus_error
 from khop_env.results.recording import ObserverRecord, Progress, Recording
 from khop_env.scenarios import Scenario
@@ -46,7 +47,7 @@ def require_video(path: str | Path) -> None:
         raise ValueError(f"{path}: a video's name ends in {' or '.join(SIZES)}; got {ending or 'no ending'!r}")
     missing = [name for name in _PACKAGES[ending] if importlib.util.find_spec(name) is None]
     if missing:
-        raise ModuleNotFoundError(f"{path}: videos need {' and '.join(missing)}: pip install 'khop_env[render]'")
+        raise ModuleNotFoundError(f"{path}: videos need {' and '.join(missing)}: {how_to_install('render')}")
     if ending == ".mp4":
         _ffmpeg()
 

@@ -13,6 +13,7 @@ import numpy as np
 from pettingzoo.utils import parallel_to_aec
 
 from khop_env.env import JointEnv, KHopEnv
+from khop_env.extras import how_to_install
 from khop_env.testing.subject import Skip, Subject
 
 # What these checks warn of in environments of this library, on purpose: PettingZoo's own tests give `reset` an option
@@ -59,7 +60,7 @@ def sb3(subject: Subject) -> str:
     """SB3's check_env, with the team as one agent."""
     team = _team(subject)
     if importlib.util.find_spec("stable_baselines3") is None:
-        raise Skip("Stable-Baselines3 isn't installed: pip install 'khop_env[rl]'")
+        raise Skip(f"Stable-Baselines3 isn't installed: {how_to_install('rl')}")
     from stable_baselines3.common.env_checker import check_env
 
     with _collected(subject) as notes:

@@ -243,7 +243,7 @@ class TestAsAnObject:
         monkeypatch.setitem(sys.modules, "pygame", None)
         drawn = renderer()
         for draw in (drawn.frame, drawn.show):
-            with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
+            with pytest.raises(ModuleNotFoundError, match=r"pip install -c constraints.txt -e '\.\[render\]'"):
                 draw(*scene())
 
     @pytest.mark.parametrize("again", [False, True])

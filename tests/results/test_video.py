@@ -112,7 +112,7 @@ def test_refusals(run, tmp_path, monkeypatch):
         with pytest.raises(ValueError, match="expected fps"):
             write_video(*run, tmp_path / "film.gif", **options)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install -c constraints.txt -e '\.\[render\]'"):
         require_video("film.mp4")
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.env.rendering.scene import INK
+from khop_env.extras import how_to_install
 from khop_env.observers import FloatArray
 
 Rect = tuple[float, float, float, float]
@@ -35,7 +36,7 @@ def load_pygame() -> ModuleType:
     try:
         import pygame
     except ModuleNotFoundError:
-        raise ModuleNotFoundError("rendering needs pygame-ce: pip install 'khop_env[render]'") from None
+        raise ModuleNotFoundError(f"rendering needs pygame-ce: {how_to_install('render')}") from None
     return pygame
 
 
