@@ -284,7 +284,7 @@ class TestAssumptions:
         for disturbance in (Coupling(0.5), Drizzle(0.2)):
             found = assumption(design_report(path_of(disturbance=disturbance)), "5")
             assert found["status"] == "not known"
-            assert "vanishes as agents meet, or is your own" in found["why"]
+            assert "vanishes in agreement, or is your own" in found["why"]
         heading = Sinusoid((0.0, 0.0, 0.3))
         bound = Exponential(10.0, 0.1, 5.0)
         found = assumption(

@@ -106,7 +106,7 @@ def test_the_observer_is_chosen(tmp_path, monkeypatch):
 
 def test_refusals(run, tmp_path, monkeypatch):
     for name in ("film.avi", "film", "mp4"):
-        with pytest.raises(ValueError, match=r"ends in \.mp4 or \.gif"):
+        with pytest.raises(ValueError, match=r"must end in \.mp4 or \.gif"):
             require_video(tmp_path / name)
     for options in ({"fps": 0}, {"fps": 100}, {"speed": 0.0}, {"speed": float("nan")}):
         with pytest.raises(ValueError, match="expected fps"):
