@@ -92,7 +92,7 @@ def test_an_unknown_agent_is_refused(tmp_path):
 
 
 def legend_of(rows: list[tuple[str, str]], tmp_path, monkeypatch) -> list[str]:
-    """The legend's entries for rows of a table of policies and observation modes."""
+    """Legend entries for rows of policies and observation modes."""
     from matplotlib.figure import Figure
 
     kept = []
