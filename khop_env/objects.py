@@ -33,9 +33,7 @@ def load_object(name: str) -> Any:
             and the exception is its cause.
     """
     source, _, attribute = name.rpartition(":")
-    if (
-        not source or attribute.endswith(".py") or "/" in attribute or os.sep in attribute
-    ):  # the colon belongs to the path
+    if not source or attribute.endswith(".py") or "/" in attribute or os.sep in attribute:  # a colon within the path
         source, attribute = name, ""
     found: Any = _file(source) if source.endswith(".py") else _module(source)
     for part in filter(None, attribute.split(".")):

@@ -1,4 +1,4 @@
-"""What the README shows runs, and so do the examples."""
+"""The code in the README runs, and so do the examples."""
 
 import re
 import runpy

@@ -1,4 +1,4 @@
-"""The non-stiff part of the state observers: what they predict from the models, f_i(x_hat) + g_hat."""
+"""The non-stiff part of the state observers: their prediction from the models, f_i(x_hat) + g_hat."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Prediction:
     """f_i(x_hat) + g_hat of all state observers.
 
     Args:
-        design: which observers know f_i, and which have an input observer beside them.
+        design: the observers, with the options `drift` and `input_observer` of each target.
         num_envs: number of environments B.
     """
 

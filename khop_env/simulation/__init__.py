@@ -1,4 +1,4 @@
-"""Plant and observers advance together: the plant's stepper, the simulator, its state, and what a law sees."""
+"""Plant and observers advance together: the plant's stepper, the simulator, its state, and the view of a law."""
 
 from khop_env.simulation.plant import FleetPlant
 from khop_env.simulation.simulator import InitialSet, Simulator

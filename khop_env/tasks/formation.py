@@ -1,4 +1,4 @@
-"""Keep a formation: p_j - p_i = r_j - r_i along the edges of the task graph, wherever it stands."""
+"""Keep a formation anywhere: p_j - p_i = r_j - r_i along the edges of the task graph."""
 
 from __future__ import annotations
 

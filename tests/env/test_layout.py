@@ -27,7 +27,7 @@ def expected_state(model, states, prefix):
 
 
 def expected_own(env, i):
-    """What agent i is to see of itself."""
+    """Expected values of agent i's own fields."""
     fleet, settings_ = env.batched.fleet, env.batched.settings
     model, states = fleet.models[i], env.batched.simulator.x[0, fleet.state_slice(i)]
     names = list(model.states)
@@ -51,7 +51,7 @@ def order_of_slots(env, i):
 
 
 def known_state(env, i, j, hops):
-    """What agent i is to know of agent j's state in this mode; None for nothing."""
+    """The state of agent j that agent i should observe in this mode; None for zeros."""
     simulator, fleet, mode = env.batched.simulator, env.batched.fleet, env.batched.settings.observe
     truth = simulator.x[0, fleet.state_slice(j)]
     if hops[j] == 1 or mode == "oracle":
@@ -71,7 +71,7 @@ def delta(env, j):
 
 
 def expected_slot(env, i, number, j, hops, wanted):
-    """What the slot of agent j is to hold."""
+    """Expected values of the slot of agent j."""
     fleet, task, name = env.batched.fleet, env.batched.task, f"slot{number}"
     known = known_state(env, i, j, hops)
     if known is None:
