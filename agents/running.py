@@ -1,4 +1,4 @@
-"""A policy in its environment, stepped and recorded as a simulator is."""
+"""A policy in its environment, with the interface of a simulator, for recordings."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from khop_env.simulation import Observe, Simulator
 
 
 class PolicyRun:
-    """What `results.record` takes: a simulator whose steps are control periods of an environment with a policy.
+    """A policy in closed loop with its environment, to be passed to `results.record`; a step is a control period.
 
     Args:
         env: the environment; it is reset.
-        policy: who plays.
-        seed: of the episode.
+        policy: the policy.
+        seed: seed of the episode.
     """
 
     def __init__(self, env: KHopEnv, policy: Policy, seed: int) -> None:
@@ -39,21 +39,21 @@ class PolicyRun:
 
     @property
     def duration(self) -> float:
-        """Of the episode, in s."""
+        """Length of the episode in s."""
         settings = self.env.batched.settings
         return settings.max_cycles * settings.control_period
 
     @property
     def extremes(self) -> Extremes:
-        """The largest ratios since the reset, not only since the last action."""
+        """The largest ratios since the reset, over all actions."""
         return self._extremes.copied()
 
     def task_error(self) -> float:
-        """Mean over the agents of their task error now."""
+        """Current task error, mean over the agents."""
         return float(self.env.batched.task_errors().mean())
 
     def step(self, dt: float) -> None:
-        """One control period, whose length `dt` has to be."""
+        """Advance by one control period; `dt` must be its length."""
         actions: Mapping[str, Any] = self.policy.act(self._observations)
         self._observations, *_ = self.env.step(actions)
         for running, now in zip(self._extremes, self.simulator.extremes, strict=True):
@@ -64,14 +64,14 @@ def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float,
     """A learned policy in the environment that it was trained for.
 
     Args:
-        spec: e.g. "ppo:runs/mine"; "ppo:pretrained" is the only shipped one for the scenario.
-        scenario: where it acts.
+        spec: e.g. "ppo:runs/first"; "ppo:pretrained" if a single policy is shipped for the scenario.
+        scenario: scenario of the environment.
         observe: observation mode.
-        duration: of the episode in s, rounded up to whole control periods.
-        seed: of the episode.
+        duration: length of the episode in s, rounded up to whole control periods.
+        seed: seed of the episode.
 
     Raises:
-        PolicyFileError: for a policy that doesn't fit.
+        PolicyFileError: if the policy doesn't fit the environment.
     """
     policy = make_policy(spec)
     about = policy.about_for(scenario.name) if isinstance(policy, PretrainedPolicy) else policy.about  # type: ignore[attr-defined]

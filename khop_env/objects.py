@@ -1,4 +1,4 @@
-"""Python objects by name, for arguments of the command line: `my_module:make_env`."""
+"""Load Python objects by name, for the command line: `my_module:make_env`."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-_LISTED = 8  # names of a module, in an error
+_LISTED = 8  # names of a module in an error message
 
 
 def load_object(name: str) -> Any:
-    """An attribute of a module or of a file, or the module itself.
+    """Load an attribute of a module or a file, or the module itself.
 
         load_object("my_module:make_env")
         load_object("path/to/my_file.py:Configuration.make")
         load_object("mpe2.simple_spread_v3")
 
-    Modules are searched among installed ones and in the working directory. A file becomes a module of its own name, and
-    its folder is searched too, so that it can import files beside it and its objects can be pickled.
+    Modules are searched for among installed packages and in the working directory. A file is imported as a module with
+    its own name, and its folder is added to the search path, so that it can import files beside it and its objects can
+    be pickled.
 
     Args:
-        name: "module:attribute", "file.py:attribute", or without the attribute.
+        name: "module:attribute" or "file.py:attribute"; the attribute may be omitted.
 
     Raises:
-        ValueError: if there is no such module, file or attribute, or if importing it raises; then with the file and the
-            line that it came from, and with the exception itself as the cause.
+        ValueError: if module, file or attribute doesn't exist, or importing raises; then the message has file and line,
+            and the exception is its cause.
     """
     source, _, attribute = name.rpartition(":")
-    if not source or attribute.endswith(".py") or "/" in attribute or os.sep in attribute:  # a colon of the path's own
+    if not source or attribute.endswith(".py") or "/" in attribute or os.sep in attribute:  # a colon within the path
         source, attribute = name, ""
     found: Any = _file(source) if source.endswith(".py") else _module(source)
     for part in filter(None, attribute.split(".")):
@@ -46,7 +47,7 @@ def load_object(name: str) -> Any:
 
 
 def is_object_name(name: str) -> bool:
-    """True if a text is a name for `load_object`: "module:attribute", or a file that ends in .py."""
+    """True if a text has the form of `load_object`: "module:attribute", or a file that ends in .py."""
     source, _, attribute = name.rpartition(":")
     if name.endswith(".py") or source.endswith(".py"):
         return True
@@ -55,11 +56,11 @@ def is_object_name(name: str) -> bool:
 
 
 def described(error: BaseException, file: str = "") -> str:
-    """An exception and where it was raised: "ValueError: no such fleet (my_file.py, line 3, in make_env)".
+    """Describe an exception and where it was raised: "ValueError: no such fleet (my_file.py, line 3, in make_env)".
 
     Args:
         error: the exception.
-        file: end of the path of a file; the last frame in it is named instead of the last frame of all.
+        file: end of a path; the innermost line in that file is named instead of the innermost of all.
     """
     text = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError) and error.filename is not None:
@@ -72,7 +73,7 @@ def described(error: BaseException, file: str = "") -> str:
 
 
 def _short(filename: str) -> str:
-    """A path as seen from the working directory, or from where packages are installed."""
+    """A path relative to the working directory or to the folder of installed packages."""
     path = Path(filename)
     for folder in (*(parent for parent in path.parents if parent.name == "site-packages"), Path.cwd()):
         if path.is_relative_to(folder):
@@ -81,9 +82,9 @@ def _short(filename: str) -> str:
 
 
 def _module(name: str) -> ModuleType:
-    """An installed module, or one in the working directory."""
+    """Import an installed module, or a module in the working directory."""
     if not all(part.isidentifier() for part in name.split(".")):
-        raise ValueError(f"{name!r} names no Python object: write my_module:name or my_file.py:name")
+        raise ValueError(f"{name!r} isn't the name of a Python object; expected my_module:name or my_file.py:name")
     _search(Path.cwd())
     try:
         return importlib.import_module(name)
@@ -96,10 +97,10 @@ def _module(name: str) -> ModuleType:
 
 
 def _file(text: str) -> ModuleType:
-    """A file as a module."""
+    """Import a file as a module."""
     path = Path(text).resolve()
     if not path.is_file():
-        raise ValueError(f"no file {text!r} (seen from {Path.cwd()})")
+        raise ValueError(f"no file {text!r} (relative to {Path.cwd()})")
     known = sys.modules.get(path.stem)
     if known is not None:
         if Path(getattr(known, "__file__", None) or "").resolve() == path:
@@ -120,7 +121,7 @@ def _file(text: str) -> ModuleType:
 
 
 def _search(folder: Path) -> None:
-    """Add a folder to the search path of imports, after all installed packages."""
+    """Append a folder to the search path of imports."""
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
 

@@ -68,7 +68,7 @@ def test_every_promised_figure_is_printed():
 
 
 def test_ratios_to_peers(tmp_path, monkeypatch):
-    """To those that are installed: ours over theirs, and what is compared stands beside it."""
+    """To installed peers: our rate over the peer's, with the compared cases in the row."""
     asked = []
 
     def peer_rate(python, peer, batch, threads, seconds):
@@ -127,7 +127,7 @@ def test_a_peer_that_fails_costs_its_ratio_only(tmp_path):
 
 @pytest.fixture
 def quick_parts(monkeypatch):
-    """The parts that need no more than the core, each a row."""
+    """Parts that need the core only, with a row each."""
     for index, name in enumerate(("_against_explicit", "_growth")):
         monkeypatch.setattr(module, name, lambda add, *rest, index=index: add(f"row {index}", 1.0))
     monkeypatch.setattr(module, "_ratio_to_floor", lambda quick: 2.0)

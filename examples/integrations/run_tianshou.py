@@ -61,10 +61,10 @@ collected = collector.collect(n_episode=COPIES, reset_before_collect=True)
 assert collected.n_collected_steps == COPIES * CYCLES * len(env.agents), collected
 assert collected.returns.shape == (COPIES, len(env.agents)), collected
 
-before = torch.cat([weights.detach().ravel() for weights in actor.parameters()])
+before = torch.cat([weight.detach().ravel() for weight in actor.parameters()])
 with policy_within_training_step(team.policy):
     team.update(collector.buffer, batch_size=64, repeat=1)
-after = torch.cat([weights.detach().ravel() for weights in actor.parameters()])
+after = torch.cat([weight.detach().ravel() for weight in actor.parameters()])
 assert after.isfinite().all()
 assert (after != before).any()
 print(

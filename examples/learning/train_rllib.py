@@ -56,16 +56,15 @@ def policy_of(agent, episode=None, **_) -> str:
 
 
 def rows(part) -> dict[str, np.ndarray]:
-    """All parameters of each policy in a row, of a learner or an env runner."""
+    """All parameters of each policy as one vector, of a learner or an env runner."""
     parameters = {name: part.module[name].parameters() for name in policies}
     return {
-        name: np.concatenate([weights.detach().numpy().ravel() for weights in several])
-        for name, several in parameters.items()
+        name: np.concatenate([each.detach().numpy().ravel() for each in group]) for name, group in parameters.items()
     }
 
 
 def weights(algorithm) -> list[dict[str, np.ndarray]]:
-    """The learner's, and those that each env runner plays with."""
+    """Parameters of the learner, and of each env runner."""
     learner = [result.get() for result in algorithm.learner_group.foreach_learner(rows)]
     return learner + algorithm.env_runner_group.foreach_env_runner(rows)
 
@@ -91,8 +90,8 @@ logging.getLogger("ray.rllib").setLevel(logging.ERROR)
 config = (
     PPOConfig()
     .environment("khop", env_config=arguments)
-    # A runner with as many requests unanswered (1 by default) is sent no weights, and on a busy machine a restored
-    # algorithm would play on with random ones.
+    # An env runner with this many open requests (default: 1) gets no new weights; on a busy machine a restored
+    # algorithm would sample with random weights.
     .env_runners(num_env_runners=options.env_runners, max_requests_in_flight_per_env_runner=10)
     .multi_agent(policies=set(policies), policy_mapping_fn=policy_of)
     .rl_module(model_config={"fcnet_hiddens": [64, 64]})
@@ -108,7 +107,7 @@ for _ in range(options.iterations):
 trained = weights(algorithm)
 assert all((trained[0][name] != fresh[name]).any() for name in policies), "a policy didn't learn"
 
-# each env runner plays episodes of its own
+# each env runner has episodes of its own
 runners = algorithm.env_runner_group
 states = runners.foreach_env_runner(lambda runner: runner.env.envs[0].unwrapped.par_env.state(), local_env_runner=False)
 assert len(states) == len({state.tobytes() for state in states}) == options.env_runners, states
@@ -116,8 +115,8 @@ assert len(states) == len({state.tobytes() for state in states}) == options.env_
 checkpoint = algorithm.save_to_path(options.out.resolve())
 algorithm.stop()
 restored = PPO.from_checkpoint(checkpoint)
-for ours, theirs in zip(weights(restored), trained, strict=True):
-    assert all((ours[name] == theirs[name]).all() for name in policies), "the restored weights are others"
+for found, saved in zip(weights(restored), trained, strict=True):
+    assert all((found[name] == saved[name]).all() for name in policies), "the restored weights differ"
 result = train(restored)
 assert result["training_iteration"] == options.iterations + 1, result["training_iteration"]
 assert result["env_runners"]["num_env_steps_sampled_lifetime"] >= (options.iterations + 1) * EPISODES * CYCLES

@@ -1,4 +1,4 @@
-"""TorchRL: MAPPO, where agents share an actor and a critic sees what all of them see; IPPO by a flag.
+"""TorchRL: MAPPO, with a shared actor and a critic on all observations; IPPO by a flag.
 
 python -m venv .venv-torchrl
 .venv-torchrl/bin/pip install -c constraints.txt -e . 'torchrl>=0.14'
@@ -30,7 +30,7 @@ parser = argparse.ArgumentParser(description="MAPPO or IPPO by TorchRL")
 parser.add_argument("environment", nargs="?", default="consensus_v0", choices=environments())
 parser.add_argument("--scenario", help="default: the environment's own")
 parser.add_argument("--observe", default="estimate", choices=("estimate", "oracle", "local"))
-parser.add_argument("--ippo", action="store_true", help="a critic that sees what its agent sees")
+parser.add_argument("--ippo", action="store_true", help="a critic on the own observation only")
 parser.add_argument("--iterations", type=int, default=12)
 options = parser.parse_args()
 

@@ -68,7 +68,7 @@ def train(
                     f"end {evaluation.final_task_error:.3f} m, largest |e| {evaluation.max_normalized_disagreement:.3f}"
                 )
 
-        training = train(config, folder, resume=resume, told=told)
+        training = train(config, folder, resume=resume, on_progress=told)
     best = max((one.mean_return for one in training.curve), default=None)
     if training.finished:
         typer.echo(f"best of {len(training.curve)} evaluations: {best:.3f}; {training.seconds:.0f} s")

@@ -40,9 +40,12 @@ def write_scenario(scenario: Scenario) -> str:
         ("duration", "s"),
         ("dt", "s, step of the proximal integrator"),
         ("order", "its order, 1 or 2"),
+        ("figure_agent", "index of the agent whose estimates figures show"),
     ):
-        value = tomlkit.item(_plain(getattr(scenario, name)))
-        document.add(name, value.comment(comment) if comment else value)
+        content = getattr(scenario, name)
+        if content is not None:
+            value = tomlkit.item(_plain(content))
+            document.add(name, value.comment(comment) if comment else value)
 
     agents = tomlkit.aot()
     for first, stop in _runs(scenario):

@@ -75,6 +75,7 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
         "description": root.take("description", str, ""),
         "k": root.take("k", int),
         **{key: root.take(key, type(defaults[key]), defaults[key]) for key in ("relay", "duration", "dt", "order")},
+        "figure_agent": root.take("figure_agent", int, None),
     }
     k = values["k"]
     if k is not REQUIRED and k < (2 if values["relay"] else 1):

@@ -45,4 +45,5 @@ def paper() -> Scenario:
         disturbance=Sinusoid(0.3, frequency=(0.5, 2.0)),
         radius=1.5,
         law=LawChoice("tanh", {"gain": gain}),
+        figure_agent=3,  # agent 4 of the paper, which counts from 1
     )

@@ -64,6 +64,7 @@ class Scenario:
         duration: length of an experiment in s.
         dt: step in s.
         order: of the proximal step.
+        figure_agent: index of the agent whose estimates figures show; None for the agent with most observers.
 
     Raises:
         ValueError: if graphs, sets and agents don't match; the message names them.
@@ -86,6 +87,7 @@ class Scenario:
     duration: float = 10.0
     dt: float = 0.01
     order: int = 2
+    figure_agent: int | None = None
 
     def __post_init__(self) -> None:
         self._check_values()
@@ -126,6 +128,12 @@ class Scenario:
         if not 0 < len(self.models) <= MOST_AGENTS:
             raise ValueError(
                 f"scenario {self.name!r}: expected 1 to {MOST_AGENTS} models, one per agent; got {len(self.models)}"
+            )
+        agent = self.figure_agent
+        if agent is not None and (type(agent) is not int or not 0 <= agent < len(self.models)):
+            raise ValueError(
+                f"scenario {self.name!r}: figure_agent must be None or an agent's index from 0 to "
+                f"{len(self.models) - 1}; got {agent!r}"
             )
         try:
             number_of_steps(self.duration, self.dt)
