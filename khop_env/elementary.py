@@ -136,6 +136,16 @@ def log_ratio(e: float) -> float:
 
 
 @compiled
+def all_finite(values: NDArray[np.float64]) -> bool:
+    """Whether no value of a contiguous array is infinite or NaN."""
+    total = 0.0
+    flat = values.ravel()
+    for q in range(flat.size):
+        total += 0.0 * flat[q]  # 0, or NaN for good
+    return total == 0.0
+
+
+@compiled
 def weighted_sum(
     base: NDArray[np.float64],
     weights: NDArray[np.float64],

@@ -282,14 +282,16 @@ class BatchedEnv:
 
     def _observed(self, outcome: Outcome) -> tuple[Float32Array, Infos]:
         observations, clipped = self._observe()
-        seen, shape = self.simulator.extremes, (self.num_envs, len(self.agents))
-        ratios = {
-            "max_normalized_disagreement": np.maximum(seen.normalized, seen.input_normalized),
-            "max_error_to_bound": np.maximum(seen.relative, seen.input_relative),
-        }
+        seen = self.simulator.running_extremes
         return observations, {
             **outcome.infos,
-            **{name: np.broadcast_to(values[:, None], shape).copy() for name, values in ratios.items()},
+            "max_normalized_disagreement": self._for_all(seen.normalized, seen.input_normalized),
+            "max_error_to_bound": self._for_all(seen.relative, seen.input_relative),
             "clipped_observations": clipped,
             "clipped_actions": self._clipped_actions.copy(),
         }
+
+    def _for_all(self, of_states: FloatArray, of_inputs: FloatArray) -> FloatArray:
+        """(B, N) the larger of two ratios (B,), the same for all agents of a copy."""
+        out = np.empty((self.num_envs, len(self.agents)))
+        return np.maximum(of_states[:, None], of_inputs[:, None], out=out)

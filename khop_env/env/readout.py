@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -93,7 +93,7 @@ class Readout:
         kinds, rows = [columns[q].kind for q in live], [columns[q].row for q in live]
         # float32 bounds, so that what is clipped to them in float64 is inside them as float32, too
         bounds = np.array([columns[q].bounds for q in live], np.float32).reshape(-1, 2).astype(float)
-        self._live = _LiveColumns(
+        live_columns = _LiveColumns(
             np.array(live, np.int64),
             np.array(kinds, np.int64),
             np.array(rows, np.int64),
@@ -102,19 +102,24 @@ class Readout:
             np.ascontiguousarray(bounds[:, 0]),
             np.ascontiguousarray(bounds[:, 1]),
         )
+        self._live: Any = tuple(live_columns)  # Numba recognises the types of a plain tuple more quickly
         self.uses_bounds = BOUND in kinds
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
     def __call__(self, sources: Sources, clipped: IntArray) -> Float32Array:
         """Vectors (B, columns) in new memory; adds to `clipped` (B, owners) how many values had to be clipped."""
         out = np.empty((sources.x.shape[1], len(self.template)), np.float32)
-        fill(self._live, self.template, sources, out, clipped)
+        fill(self._live, self.template, tuple(sources), out, clipped)
         return out
 
 
 @compiled
-def fill(live: _LiveColumns, template: Float32Array, sources: Sources, out: Float32Array, clipped: IntArray) -> None:
-    """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner."""
+def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, clipped: IntArray) -> None:
+    """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner.
+
+    `live` and `sources` are the fields of `_LiveColumns` and `Sources` as plain tuples.
+    """
+    live, sources = _LiveColumns(*live), Sources(*sources)
     x, estimate = sources.x, sources.estimate
     values = np.empty(_TILE)
     for first in range(0, out.shape[0], _TILE):

@@ -185,15 +185,16 @@ class WidthsNow:
 
     def __init__(self, bank: FunnelBank, num_envs: int) -> None:
         self._bank = bank
-        self._time = np.full(num_envs, np.nan)
+        self._time = b""
         self._values = np.ones((len(bank), num_envs))
 
     def at(self, t: FloatArray) -> FloatArray:
         """(rows, B) widths at the times `t` (B,); overwritten by the next instant's."""
-        if not np.array_equal(t, self._time):
-            self._time.fill(np.nan)  # whatever the evaluation raises, half of it isn't taken for the whole
+        now = t.tobytes()
+        if now != self._time:
+            self._time = b""  # should the evaluation raise, half of it isn't taken for the whole
             self._bank.evaluate(t, self._values)
-            self._time[...] = t
+            self._time = now
         return self._values
 
 
@@ -237,7 +238,14 @@ class FunnelObservers:
         """Raise running maxima of |xi| / rho and |x_tilde| / delta, and of the same for inputs, to those of a state."""
         memory = state.memory
         for funnels, widths, estimate, source, normalized, relative in (
-            (self.design.states, self.rho, memory["estimate"], state.x, extremes.normalized, extremes.relative),
+            (
+                self.design.states,
+                self.rho,
+                memory["estimate"],
+                state.x,
+                extremes.normalized,
+                extremes.relative,
+            ),
             (
                 self.design.inputs,
                 self.omega,
@@ -249,4 +257,4 @@ class FunnelObservers:
         ):
             if funnels.layout.size:
                 rho = widths.at(state.t)
-                largest_ratios(funnels.layout.arrays, estimate, source, rho, funnels.gain, normalized, relative)
+                largest_ratios(funnels.layout.packed, estimate, source, rho, funnels.gain, normalized, relative)

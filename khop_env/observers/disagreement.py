@@ -115,7 +115,7 @@ def largest_ratios(
     """Raise running maxima to the largest |xi| / rho and |x_tilde| / delta over all pairs and components.
 
     Args:
-        pairs: `PairLayout.arrays`.
+        pairs: `PairLayout.packed`.
         estimate: (P, B) estimates.
         source: (n, B) the true values.
         rho: (rows, B) funnels.
@@ -123,6 +123,7 @@ def largest_ratios(
         normalized: (B,) running maxima of |xi| / rho; inf where a number isn't finite.
         relative: (B,) running maxima of |x_tilde| / delta.
     """
+    pairs = PairArrays(*pairs)
     batch = estimate.shape[1]
     xi = np.empty(batch)
     for t in range(pairs.observers.size):

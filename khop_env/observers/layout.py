@@ -187,6 +187,11 @@ class PairLayout:
         )
 
     @cached_property
+    def packed(self) -> PairArrays:
+        """`arrays` as a plain tuple, whose type Numba recognises more quickly: for kernels that are called often."""
+        return tuple(self.arrays)  # type: ignore[return-value]
+
+    @cached_property
     def blocks(self) -> tuple[TargetBlock, ...]:
         """The targets one after the other, for loops in Python."""
         first_six = zip(*(values.tolist() for values in self.arrays[:6]), strict=True)

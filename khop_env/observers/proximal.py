@@ -71,8 +71,8 @@ class Proximal(FunnelObservers):
         self.order, self.threads = order, threads
         self.evaluations = 0
         self._tableau = TABLEAUS[order]
-        self._explicit = [np.array(row) for row in self._tableau.explicit]
-        self._implicit = [np.array(row) for row in self._tableau.implicit]
+        self._explicit, self._implicit = self._tableau.explicit, self._tableau.implicit
+        self._dt = math.nan
 
     def prepare(self, design: ObserverDesign, num_envs: int) -> None:
         """Allocate what steps of `design` need in `num_envs` environments."""
@@ -97,13 +97,12 @@ class Proximal(FunnelObservers):
         Raises:
             SolveError: if a state, input, disturbance or estimate isn't finite.
         """
-        memory, last = state.memory, before.memory
+        memory, last, weights = state.memory, before.memory, self._weights_of(dt)
         estimate, input_estimate = memory["estimate"], memory["input_estimate"]
         for s, node in enumerate(self._tableau.nodes):
             # rates at the stage before: the state holds that stage's values, at its time
             self._prediction.rate(state.t, estimate, input_estimate, self._rates[s])
-            explicit, implicit = self._explicit[s] * dt, self._implicit[s] * dt
-            tau = float(implicit[s])
+            explicit, implicit, tau = weights[s]
             plant.stage(s, explicit, node * dt, before, state)
             weighted_sum(last["estimate"], explicit, self._rates[: s + 1], estimate)
             if s:
@@ -118,6 +117,14 @@ class Proximal(FunnelObservers):
                 omega = self.omega.at(state.t)
                 found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], self._input_slopes[s])
                 self._account(found, self.design.inputs, state.g, omega)
+
+    def _weights_of(self, dt: float) -> list[tuple[FloatArray, FloatArray, float]]:
+        """Per stage the explicit weights, the implicit ones, and the last of these, all in s."""
+        if dt != self._dt:
+            explicit, implicit = ([np.array(row) * dt for row in rows] for rows in (self._explicit, self._implicit))
+            self._weights = [(a, b, float(b[-1])) for a, b in zip(explicit, implicit, strict=True)]
+            self._dt = dt
+        return self._weights
 
     def _account(
         self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray

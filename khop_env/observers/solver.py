@@ -22,7 +22,7 @@ class Solver:
     """
 
     def __init__(self, layout: PairLayout, num_envs: int, threads: int) -> None:
-        self._pairs = layout.arrays
+        self._pairs = layout.packed
         targets = len(layout.target)
         by_environment = num_envs >= threads * LANES
         cuts = np.linspace(0, num_envs if by_environment else targets, threads + 1).astype(int).tolist()

@@ -32,9 +32,8 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f"known: {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}"
 
 
-def read_only(array: FloatArray) -> FloatArray:
-    """A view that can't be written through."""
-    view = array.view()
+def read_only(view: FloatArray) -> FloatArray:
+    """The view itself, which can't be written through any more."""
     view.flags.writeable = False
     return view
 

@@ -6,12 +6,11 @@ disturbances and users get are views (B, ...) of them.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
-from khop_env.elementary import weighted_sum
+from khop_env.elementary import all_finite, weighted_sum
 from khop_env.observers import FloatArray, PlantState, SolveError
 from khop_env.physics import Fleet, read_only
 from khop_env.simulation.view import Law, ViewBuilder
@@ -34,11 +33,12 @@ class FleetPlant:
         self.fleet, self.num_envs = fleet, num_envs
         self.disturbance, self.law, self.views = disturbance, law, views
         self._rates: tuple[FloatArray, ...] = ()
+        self._states = self._inputs = self._effects = np.zeros((0, 0))
         self._w = np.zeros((fleet.n, num_envs)).T  # (B, n) in the memory order of the states
 
     def rate(self, state: PlantState, out: FloatArray) -> None:
         """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
-        states = read_only(state.x.T)
+        states = self._bind(state)
         self.fleet.drift(state.t, states, out.T)
         out += state.g
         if self.disturbance is not None:
@@ -72,7 +72,15 @@ class FleetPlant:
                     f"{(self.num_envs, self.fleet.m)}"
                 )
             state.u.T[:] = u
-        self.fleet.input_map(state.t, read_only(state.x.T), read_only(state.u.T), state.g.T)
+        states = self._bind(state)
+        self.fleet.input_map(state.t, states, self._inputs, self._effects)
+
+    def _bind(self, state: PlantState) -> FloatArray:
+        """The states (B, n) as models see them; views are made once, and again for the arrays of another state."""
+        if self._states.base is not state.x:
+            self._states, self._inputs = read_only(state.x.T), read_only(state.u.T)
+            self._effects = state.g.T
+        return self._states
 
 
 def require_finite(x: FloatArray, fleet: Fleet) -> None:
@@ -81,7 +89,7 @@ def require_finite(x: FloatArray, fleet: Fleet) -> None:
     Raises:
         SolveError: naming the environment, agent and component.
     """
-    if math.isfinite(x.sum()):
+    if all_finite(x):
         return
     for column, env in np.argwhere(~np.isfinite(x)).tolist():
         agent, name, _ = fleet.component_names()[column]

@@ -101,6 +101,7 @@ class Simulator:
     Attributes:
         state: everything that a step reads and writes, batch last.
         observers: this simulator's own copy.
+        running_extremes: what `extremes` copies; overwritten by steps.
 
     Raises:
         DesignError: if the initial set doesn't fit into the funnels.
@@ -145,7 +146,7 @@ class Simulator:
             links=LinkState.ideal(design.links, num_envs),
         )
         self._before = self.state.copy()
-        self._extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
+        self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach, pushed = np.abs(initial.center) + initial.radius, np.zeros(self.fleet.n)
         self._longest_step, self._stiffest = self.fleet.explicit_step(
             reach, pushed if attached is None else attached.bound
@@ -157,7 +158,7 @@ class Simulator:
     @property
     def t(self) -> FloatArray:
         """(B,) time since reset in s."""
-        return read_only(self.state.t)
+        return read_only(self.state.t.view())
 
     @property
     def x(self) -> FloatArray:
@@ -187,7 +188,7 @@ class Simulator:
     @property
     def extremes(self) -> Extremes:
         """The largest ratios at any grid point since the last reset."""
-        return self._extremes.copied()
+        return self.running_extremes.copied()
 
     def error_bounds(self) -> Certified:
         """The guaranteed bound on the error of every estimate now, (P, B), batch last, and what it rests on."""
@@ -243,12 +244,12 @@ class Simulator:
                 state.drawn[b] = disturbance.draw(rng)
         if start is not None:
             state.x[:, chosen] = np.broadcast_to(start, (len(chosen), self.fleet.n)).T
-        for zeros in (state.t, state.u, *self._extremes):
+        for zeros in (state.t, state.u, *self.running_extremes):
             zeros[..., chosen] = 0.0
         self.observers.reset(state.memory, chosen, generators, self.initial.center)
         self.plant.actuate(state)
-        self.observers.raise_extremes(state, self._extremes)
-        if not np.all(self._extremes.input_normalized[chosen] < 1.0):
+        self.observers.raise_extremes(state, self.running_extremes)
+        if not np.all(self.running_extremes.input_normalized[chosen] < 1.0):
             away = np.where(np.isfinite(self.g), np.abs(self.g), 0.0).max(axis=0)
             self.design.require_feasible_start(np.zeros(self.fleet.n), away)
         return self
@@ -307,21 +308,21 @@ class Simulator:
                 if part:
                     state.copy_step(before)
                 self.observers.advance(self.plant, before, state, dt / parts)
-                self.observers.raise_extremes(state, self._extremes)
+                self.observers.raise_extremes(state, self.running_extremes)
         except BaseException:
             start.copy_step(state)
             raise
 
     def warm_up(self) -> None:
         """Compile everything that a step runs; the state stays as it is."""
-        saved, seen = self.save(), self._extremes.copied()
+        saved, seen = self.save(), self.running_extremes.copied()
         try:
             self.advance(_WARM_UP_STEP, 1)
         except (FunnelError, SolveError):
             pass  # the first real step will raise it again
         finally:
             self.restore(saved)
-            self._extremes = seen
+            self.running_extremes = seen
 
     def save(self) -> SimulatorState:
         """Everything needed to continue bit for bit."""
@@ -335,11 +336,11 @@ class Simulator:
         """
         self.state.assign(saved)
         self.restart_extremes()
-        self.observers.raise_extremes(self.state, self._extremes)
+        self.observers.raise_extremes(self.state, self.running_extremes)
 
     def restart_extremes(self) -> None:
         """Forget the ratios seen so far: `extremes` are those of the steps to come."""
-        for running in self._extremes:
+        for running in self.running_extremes:
             running[...] = 0.0
 
     def env_list(self, env_ids: Sequence[int] | IntArray | None) -> IntArray:

@@ -95,10 +95,13 @@ class ViewBuilder:
     def update(self, x: FloatArray, estimate: FloatArray) -> View:
         """The view at states `x` (n, B) and estimates (P, B)."""
         displacements(self._kind, self._own, self._other, x, estimate, self._columns)
-        # both anew: in a copy of this object they would be views of other arrays
-        self.view.x = read_only(x.T)
-        self.view.displacement = read_only(self._columns.transpose(2, 0, 1))
-        return self.view
+        view = self.view
+        # made once, and again where this object is a copy, whose views would still be those of other arrays
+        if view.x.base is not x:
+            view.x = read_only(x.T)
+        if view.displacement.base is not self._columns:
+            view.displacement = read_only(self._columns.transpose(2, 0, 1))
+        return view
 
 
 @compiled
