@@ -14,12 +14,16 @@ import venv
 from pathlib import Path
 from site import getsitepackages as site_packages
 
+import numpy as np
 import pytest
 
 import khop_env
+from agents import compare, describe
 from khop_env import consensus_v0, formation_v0, leader_following_v0
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import Settings, SettingsArguments
+from khop_env.physics import Sinusoid
+from khop_env.results import record
 from khop_env.tasks import Consensus, EdgeArguments, EdgeTask, Formation, LeaderFollowing
 
 ROOT = Path(__file__).parents[1]
@@ -191,6 +195,69 @@ def test_signatures_show_every_argument_with_its_type_in_few_words(module, name)
         line = next(n for n, line in enumerate(help_text.splitlines()) if line.strip() == str(parameter))
         assert len(help_text.splitlines()[line + 1].strip()) > 5
     assert "_array_like" not in help_text  # NumPy's ArrayLike is a line of private names
+
+
+# -- what is printed of an object ----------------------------------------------------------------------------------
+
+
+def printed():
+    """Objects of the surface, and those that hold arrays, with parts of what they say."""
+    scenario = khop_env.scenario("random_geometric:agents=200").replace(disturbance=Sinusoid(0.1))
+    simulator = khop_env.scenario("mixed_fleet").build(num_envs=300)
+    simulator.reset(seed=0, env_ids=[1])
+    simulator.step(0.25)
+    simulator.reset(seed=0, env_ids=[1])
+    views = []
+    run = khop_env.scenario("paper").build(law=lambda t, view: views.append(view) or np.zeros((1, 16)))
+    batched = khop_env.make_batched("leader_following_v0", num_envs=300)
+    comparison = compare("consensus_v0", ["zero"], ["estimate"], seeds=range(2))
+    consensus = "consensus_v0 on 'paper': 8 drifter; k=3"
+    design, vec = scenario.design, khop_env.make_vec("consensus_v0", 2, autoreset_mode="same_step")
+    return [
+        (scenario, "Scenario('random_geometric:agents=200,k=2,seed=0': 200 integrator; k=2, ", "law 'tanh', 10 s in"),
+        (design, "ObserverDesign(200 integrator; k=2, ", f"{design.states.layout.pairs} state and "),
+        (design.states, "Funnels(layout=PairLayout("),
+        (design.links, "Links(agents=200, sender=int64["),
+        (scenario.initial, "InitialSet(center=float64[400], radius=float64[400])"),
+        (simulator, "Simulator(3 integrator, 3 cart, 3 unicycle, 3 vessel; k=3", "num_envs=300, t = 0 to 0.25 s)"),
+        (simulator, "Proximal(order=2, threads=1), no law"),
+        (simulator.save(), "SimulatorState(t=float64[300], x=float64["),
+        (run, "law <lambda>, num_envs=1, t = 0.1 s"),
+        (views[0], "View(fleet=Fleet(8 drifter), x=float64[1, 16]"),
+        (record(run, 0.1, 0.01), "Recording(8 drifter; k=3, ", "11 samples of 10 steps to t = 0.1 s"),
+        (
+            batched,
+            "BatchedEnv(leader_following_v0 on 'convoy', of which 5 act: 8 drifter; k=3",
+            "num_envs=300, t = 0 s",
+        ),
+        (batched.world, "World(design=ObserverDesign(8 drifter"),
+        (batched.get_state(), "EnvState(simulator=SimulatorState("),
+        (khop_env.make("consensus_v0", observe="oracle"), f"KHopEnv({consensus}", "observe='oracle', num_envs=1"),
+        (
+            vec,
+            f"KHopVectorEnv(16 rows, autoreset same_step; {consensus}",
+            "num_envs=2",
+        ),
+        (khop_env.make_joint("consensus_v0"), f"JointEnv({consensus}"),
+        (describe(batched), "EnvDescription(environment='leader_following_v0', scenario='convoy'"),
+        (comparison, "Comparison(environment='consensus_v0', scenario='paper', planned=2"),
+        (comparison.rows[0].episodes, "Episodes(seed=int64[2]"),
+    ]
+
+
+def test_objects_say_in_a_line_what_they_are():
+    for found, *parts in printed():
+        text = repr(found)
+        assert "\n" not in text
+        assert len(text) < 400, text
+        for part in parts:
+            assert part in text
+
+
+def test_the_sb3_environment_says_what_it_is():
+    pytest.importorskip("stable_baselines3")
+    text = repr(khop_env.make_sb3_vec("formation_v0", 2))
+    assert text.startswith("KHopSB3VecEnv(16 rows; formation_v0 on 'paper': 8 drifter; k=3, ")
 
 
 # -- type checkers -------------------------------------------------------------------------------------------------
