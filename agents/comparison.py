@@ -18,6 +18,7 @@ from agents.learning.learned import LearnedPolicy
 from agents.policies import make_policy
 from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
+from khop_env.brief import brief
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 from khop_env.registry import Environment, make_batched
@@ -48,6 +49,8 @@ class Row:
     policy: str
     env: EnvDescription
     episodes: Episodes
+
+    __repr__ = brief
 
     @property
     def observe(self) -> Observe:
@@ -90,6 +93,8 @@ class Comparison:
     scenario: str
     planned: int
     rows: list[Row] = field(default_factory=list)
+
+    __repr__ = brief
 
     def summary(self) -> dict[str, Any]:
         """The output of `khop evaluate --json`; a row with fewer episodes than planned has the key `episodes`."""

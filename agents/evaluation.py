@@ -12,6 +12,7 @@ import numpy as np
 
 from agents.policies import make_policy
 from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds
+from khop_env.brief import brief
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 from khop_env.registry import Environment, find_task
@@ -53,6 +54,8 @@ class Episodes:
     max_error_to_bound: FloatArray
     task_error: FloatArray
     time: FloatArray
+
+    __repr__ = brief
 
     @staticmethod
     def joined(parts: Sequence[Episodes]) -> Episodes:

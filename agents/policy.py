@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.env import BatchedEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
 from khop_env.physics import AgentModel
@@ -38,6 +39,8 @@ class EnvDescription:
     models: Mapping[str, AgentModel]
     layouts: Mapping[str, ObservationLayout]
     action_sizes: Mapping[str, int]
+
+    __repr__ = brief
 
     @property
     def agents(self) -> tuple[str, ...]:

@@ -11,6 +11,8 @@ from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
+from khop_env.own_agents import call_pickled
+
 
 class WorkerError(RuntimeError):
     """A worker process ended before its task was finished."""
@@ -57,13 +59,13 @@ def run_in_processes(function: Callable[[Any], Any], tasks: Sequence[Any], worke
     """
     waiting, pool = iter(enumerate(tasks)), dict[Connection, SpawnProcess]()
     try:
-        ForkingPickler.dumps(function)
+        pickled = bytes(ForkingPickler.dumps((_serve, function)))
     except Exception as error:  # pickle raises various exceptions
         raise ValueError(f"can't be sent to other processes; use workers=1 ({error})") from error
     try:
         with _sigint_blocked():
             for _ in range(min(workers, len(tasks))):
-                connection, process = _started(function)
+                connection, process = _started(pickled)
                 pool[connection] = process
         running = {connection: _assign(connection, waiting) for connection in pool}
         while busy := [connection for connection, number in running.items() if number is not None]:
@@ -80,10 +82,10 @@ def run_in_processes(function: Callable[[Any], Any], tasks: Sequence[Any], worke
             connection.close()
 
 
-def _started(function: Callable[[Any], Any]) -> tuple[Connection, SpawnProcess]:
+def _started(pickled: bytes) -> tuple[Connection, SpawnProcess]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_serve, args=(theirs, function), daemon=True)
+    process = context.Process(target=call_pickled, args=(pickled, theirs), daemon=True)
     process.start()
     theirs.close()
     return ours, process
@@ -114,7 +116,7 @@ def _received(connection: Connection, process: SpawnProcess) -> Any:
     return result
 
 
-def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
+def _serve(function: Callable[[Any], Any], connection: Connection) -> None:
     """Main loop of a worker: run tasks until the connection closes. Only the caller handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(EOFError, OSError):

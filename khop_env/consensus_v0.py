@@ -144,7 +144,7 @@ class Arguments(EdgeArguments, SettingsArguments, total=False):
 def batched_env(
     scenario: Scenario | str | Path = "paper", *, num_envs: int = 1, **arguments: Unpack[Arguments]
 ) -> BatchedEnv:
-    """`num_envs` environments as arrays (num_envs, agents, ...); arguments are described at the top of this module."""
+    """`num_envs` environments as arrays (num_envs, agents, ...); see the top of this module, too."""
     return make_batched(Consensus, scenario, num_envs=num_envs, **arguments)
 
 
@@ -152,7 +152,7 @@ def batched_env(
 def parallel_env(
     scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> KHopEnv:
-    """The PettingZoo ParallelEnv; arguments are described at the top of this module."""
+    """The PettingZoo ParallelEnv; see the top of this module, too."""
     return make(Consensus, scenario, render_mode=render_mode, **arguments)
 
 
@@ -160,7 +160,7 @@ def parallel_env(
 def env(
     scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> AECEnv:
-    """The AEC environment, by PettingZoo's own conversion; arguments are described at the top of this module.
+    """The AEC environment, by PettingZoo's own conversion; see the top of this module, too.
 
     `aec.unwrapped.layout(agent)` names the columns of an observation.
     """

@@ -129,10 +129,11 @@ and counted in the infos
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Unpack
 
-from numpy.typing import ArrayLike
+import numpy as np
 from pettingzoo import AECEnv
 
 from khop_env.env import BatchedEnv, KHopEnv, SettingsArguments
@@ -146,7 +147,7 @@ __all__ = ["batched_env", "env", "parallel_env", "raw_env"]
 class Arguments(EdgeArguments, SettingsArguments, total=False):
     """Keyword arguments of this environment."""
 
-    points: ArrayLike | None
+    points: Sequence[Sequence[float]] | np.ndarray | None
     spacing: float
 
 
@@ -154,7 +155,7 @@ class Arguments(EdgeArguments, SettingsArguments, total=False):
 def batched_env(
     scenario: Scenario | str | Path = "paper", *, num_envs: int = 1, **arguments: Unpack[Arguments]
 ) -> BatchedEnv:
-    """`num_envs` environments as arrays (num_envs, agents, ...); arguments are described at the top of this module."""
+    """`num_envs` environments as arrays (num_envs, agents, ...); see the top of this module, too."""
     return make_batched(Formation, scenario, num_envs=num_envs, **arguments)
 
 
@@ -162,7 +163,7 @@ def batched_env(
 def parallel_env(
     scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> KHopEnv:
-    """The PettingZoo ParallelEnv; arguments are described at the top of this module."""
+    """The PettingZoo ParallelEnv; see the top of this module, too."""
     return make(Formation, scenario, render_mode=render_mode, **arguments)
 
 
@@ -170,7 +171,7 @@ def parallel_env(
 def env(
     scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> AECEnv:
-    """The AEC environment, by PettingZoo's own conversion; arguments are described at the top of this module.
+    """The AEC environment, by PettingZoo's own conversion; see the top of this module, too.
 
     `aec.unwrapped.layout(agent)` names the columns of an observation.
     """

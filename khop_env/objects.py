@@ -11,6 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from khop_env.own_agents import AGENTS
+
 _LISTED = 8  # names of a module in an error message
 
 
@@ -90,6 +92,8 @@ def _module(name: str) -> ModuleType:
         return importlib.import_module(name)
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+            if name.partition(".")[0] == AGENTS:  # it says what to do
+                raise ValueError(str(error)) from None
             raise ValueError(
                 f"no module {error.name!r}, neither installed nor in the working directory; a file's name ends in .py"
             ) from None

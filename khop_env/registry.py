@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
@@ -29,6 +30,25 @@ if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
     from khop_env.env.sb3 import KHopSB3VecEnv
+
+__all__ = [
+    "SCENARIOS",
+    "Environment",
+    "ScenarioFactory",
+    "describe",
+    "environments",
+    "find_task",
+    "make",
+    "make_aec",
+    "make_batched",
+    "make_joint",
+    "make_sb3_vec",
+    "make_vec",
+    "parameters_from_text",
+    "scenario",
+    "scenarios",
+    "spelled_out",
+]
 
 ScenarioFactory = Callable[..., Scenario]
 """A function that makes a scenario; the parameters of a family are int, float, bool or str, with defaults."""
@@ -222,24 +242,51 @@ make_joint.metadata = JointEnv.metadata  # type: ignore[attr-defined]  # where g
 
 
 def spelled_out(task: type[Task]) -> Callable[[Function], Function]:
-    """Show the arguments of settings and task in the signature of a function that takes them as keywords.
+    """Show the arguments of settings and task in signature and docstring of a function that takes them as keywords.
 
     Args:
         task: the environment's.
     """
 
     def decorate(function: Function) -> Function:
-        signature = inspect.signature(function)
-        fixed = [each for each in signature.parameters.values() if each.kind is not inspect.Parameter.VAR_KEYWORD]
+        signature, own = inspect.signature(function), get_type_hints(function)
+        fixed = [
+            each.replace(annotation=own[each.name])
+            for each in signature.parameters.values()
+            if each.kind is not inspect.Parameter.VAR_KEYWORD
+        ]
         hints = get_type_hints(Settings) | get_type_hints(task)
         keywords = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
             for name, default in {**_task_parameters(task), **_defaults(Settings)}.items()
         ]
-        function.__signature__ = signature.replace(parameters=[*fixed, *keywords])  # type: ignore[attr-defined]
+        shown = signature.replace(parameters=[*fixed, *keywords], return_annotation=own["return"])
+        function.__signature__ = shown  # type: ignore[attr-defined]
+        if function.__doc__:  # there are none under python -OO
+            texts = _SHARED_ARGUMENTS | _attributes(Settings) | _attributes(task)
+            lines = [f"    {each}\n        {texts[each.name]}" for each in shown.parameters.values()]
+            function.__doc__ = inspect.cleandoc(function.__doc__) + "\n\nArgs:\n" + "\n".join(lines)
         return function
 
     return decorate
+
+
+_SHARED_ARGUMENTS = {
+    "scenario": "a name, a name with parameters, a path that ends in .toml, or a `Scenario`.",
+    "num_envs": "copies B.",
+    "render_mode": 'None, "human" or "rgb_array".',
+}
+
+
+def _attributes(cls: type) -> dict[str, str]:
+    """What the docstrings of a dataclass and its bases say of each attribute, with the line breaks of theirs."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        section = inspect.cleandoc(vars(base).get("__doc__") or "").partition("\nAttributes:\n")[2].partition("\n\n")[0]
+        for text in re.split(r"^    (?=\w)", section, flags=re.MULTILINE)[1:]:
+            name, _, words = text.partition(": ")
+            found[name] = words.strip()
+    return found
 
 
 def _task_parameters(task: type[Task]) -> dict[str, Any]:

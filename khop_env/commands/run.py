@@ -69,7 +69,7 @@ def run(
 
     Exits with 1 if a funnel was left. Whatever was computed until then is written all the same.
     """
-    from agents import make_law
+    from agents.laws import make_law
     from agents.learning import ALGORITHMS
     from agents.running import policy_run
     from khop_env.observers import Explicit, Proximal
@@ -154,7 +154,7 @@ def run(
 
 
 def _law(scenario: Scenario, controller: str | None) -> LawChoice:
-    from agents import LAWS
+    from agents.laws import LAWS
     from khop_env.registry import parameters_from_text
     from khop_env.scenarios import LawChoice
 

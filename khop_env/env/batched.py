@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from khop_env.brief import spread
 from khop_env.env.actions import ActionReader
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.layout import Float32Array, ObservationLayout
@@ -102,6 +103,14 @@ class BatchedEnv:
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeded = np.zeros(self.num_envs, bool)
         self._clipped_actions = np.zeros((self.num_envs, len(members)), np.int64)
+
+    def __str__(self) -> str:
+        act = "" if len(self.agents) == len(self.fleet) else f", of which {len(self.agents)} act"
+        made = f"{self.task.environment} on {self.scenario!r}{act}: {self.simulator.design}"
+        return f"{made}; observe={self.settings.observe!r}, num_envs={self.num_envs}, {spread(self.world.t)}"
+
+    def __repr__(self) -> str:
+        return f"BatchedEnv({self})"
 
     # -- the episode ---------------------------------------------------------------------------------------------
 

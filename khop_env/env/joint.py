@@ -47,6 +47,12 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         self.observation_space = Box(low, high, dtype=np.float32)
         self.action_space = Box(-1.0, 1.0, (int(env.batched.action_offset[-1]),), np.float32)
 
+    def __repr__(self) -> str:
+        return f"JointEnv({self.env.batched})"
+
+    def __str__(self) -> str:
+        return repr(self)  # Gymnasium's own says nothing
+
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Float32Array, dict[str, Any]]:

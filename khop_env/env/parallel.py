@@ -85,7 +85,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             self._renderer = Renderer.of(batched.task, batched.world, title=name)
 
     def __repr__(self) -> str:
-        return f"KHopEnv({self.metadata['name']}, {len(self.possible_agents)} agents)"
+        return f"KHopEnv({self.batched})"
 
     def __str__(self) -> str:
         return str(self.metadata["name"])

@@ -53,6 +53,9 @@ class KHopSB3VecEnv(VecEnv):
         )
         super().__init__(batched.num_envs * len(batched.agents), *single_spaces(batched))
 
+    def __repr__(self) -> str:
+        return f"KHopSB3VecEnv({self.num_envs} rows; {self.batched})"
+
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the next reset: environment b starts from seed + b.
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
 from khop_env.env.actuators import described
 from khop_env.env.layout import Float32Array
 from khop_env.env.settings import Settings
@@ -54,6 +55,8 @@ class EnvState:
     task: Mapping[str, FloatArray]
     generators: list[np.random.Generator | None]
     seeded: NDArray[np.bool_]
+
+    __repr__ = brief
 
     def require_of(self, environment: Mapping[str, tuple[str, ...]]) -> None:
         """Refuse an environment that the state doesn't belong to.

@@ -73,6 +73,9 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
+    def __repr__(self) -> str:
+        return f"KHopVectorEnv({self.num_envs} rows, autoreset {self.autoreset_mode.name.lower()}; {self.batched})"
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Float32Array, dict[str, Any]]:

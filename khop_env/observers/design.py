@@ -17,6 +17,7 @@ from functools import cached_property
 import networkx as nx
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.observers.performance import FunnelBank, PerformanceFunction, scaled
 from khop_env.physics import Fleet, Links, k_hop_neighbors, validate_graph
@@ -57,6 +58,8 @@ class Funnels:
 
     layout: PairLayout
     bounds: tuple[PerformanceFunction, ...]
+
+    __repr__ = brief
 
     @cached_property
     def gain(self) -> FloatArray:
@@ -185,6 +188,13 @@ class ObserverDesign:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def __str__(self) -> str:
+        pairs = f"{self.states.layout.pairs} state and {self.inputs.layout.pairs} input observers"
+        return f"{self.fleet}; k={self.k}{'' if self.relay else ', no relays'}, {pairs}"
+
+    def __repr__(self) -> str:
+        return f"ObserverDesign({self})"
 
     def with_bounds(
         self,

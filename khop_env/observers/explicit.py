@@ -85,6 +85,9 @@ class Explicit(FunnelObservers):
     def __init__(self, right_hand_side: Callable[[ObserverDesign, int], RightHandSide] = BatchedRightHandSide) -> None:
         self._make = right_hand_side
 
+    def __repr__(self) -> str:
+        return f"Explicit({self._make.__name__})" if isinstance(self._make, type) else "Explicit()"
+
     def prepare(self, design: ObserverDesign, num_envs: int) -> None:
         """Allocate the buffers for steps of `design` in `num_envs` environments."""
         super().prepare(design, num_envs)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
 from khop_env.physics import Links
 
 IntArray = NDArray[np.int64]
@@ -105,6 +106,8 @@ class PairLayout:
     links: Links
     size: int
     rows: int
+
+    __repr__ = brief
 
     @staticmethod
     def build(

@@ -74,6 +74,9 @@ class Proximal(FunnelObservers):
         self._explicit, self._implicit = self._tableau.explicit, self._tableau.implicit
         self._dt = math.nan
 
+    def __repr__(self) -> str:
+        return f"Proximal(order={self.order}, threads={self.threads})"
+
     def prepare(self, design: ObserverDesign, num_envs: int) -> None:
         """Allocate the buffers for steps of `design` in `num_envs` environments."""
         super().prepare(design, num_envs)

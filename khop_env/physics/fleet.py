@@ -102,9 +102,12 @@ class Fleet:
         """Number of agents N."""
         return len(self.models)
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         counts = Counter(model.type for model in self.models)
-        return f"Fleet({', '.join(f'{count} {kind}' for kind, count in counts.items())})"
+        return ", ".join(f"{count} {kind}" for kind, count in counts.items())
+
+    def __repr__(self) -> str:
+        return f"Fleet({self})"
 
     def state_slice(self, agent: int) -> slice:
         """Agent's part of the flat state."""

@@ -9,6 +9,8 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
+
 
 @dataclass(frozen=True, eq=False)
 class Links:
@@ -26,6 +28,8 @@ class Links:
     agents: int
     sender: NDArray[np.int64]
     receiver: NDArray[np.int64]
+
+    __repr__ = brief
 
     @staticmethod
     def of(graph: nx.Graph) -> Links:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.observers import Extremes, FloatArray, FunnelBank, FunnelError, Funnels, ObserverDesign, SolveError
 from khop_env.physics import Fleet
 from khop_env.scenarios.scenario import number_of_steps
@@ -40,6 +41,8 @@ class ObserverRecord:
     truth: FloatArray
     estimate: FloatArray
     disagreement: FloatArray
+
+    __repr__ = brief
 
     @property
     def truth_per_estimate(self) -> FloatArray:
@@ -94,6 +97,10 @@ class Recording:
     wall_time: float
     error: FunnelError | SolveError | None = None
     task_error: FloatArray | None = None
+
+    def __repr__(self) -> str:
+        samples = f"{len(self.time)} samples of {self.steps} steps to t = {self.time[-1]:g} s"
+        return f"Recording({self.design}; {samples}{'' if self.error is None else ', ended early'})"
 
     @property
     def fleet(self) -> Fleet:

@@ -140,6 +140,13 @@ class Scenario:
         except ValueError as error:
             raise ValueError(f"scenario {self.name!r}: {error}") from None
 
+    def __repr__(self) -> str:
+        edges = f"{self.communication.number_of_edges()} communication and {self.task.number_of_edges()} task edges"
+        return (
+            f"Scenario({self.name!r}: {self.fleet}; k={self.k}, {edges}; law {self.law.name!r}, {self.duration:g} s in "
+            f"steps of {self.dt:g} s)"
+        )
+
     def replace(self, **changes: Any) -> Scenario:
         """A copy with some attributes changed."""
         return replace(self, **changes)

@@ -12,6 +12,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
+from khop_env.brief import brief, spread
 from khop_env.observers import (
     Certified,
     Extremes,
@@ -50,6 +51,8 @@ class InitialSet:
 
     center: FloatArray
     radius: FloatArray
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         center, radius = np.asarray(self.center, dtype=float), np.asarray(self.radius, dtype=float)
@@ -155,6 +158,11 @@ class Simulator:
         self.reset(seed=0)
 
     # -- reading -------------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        law = self.plant.law
+        name = "no law" if law is None else f"law {getattr(law, '__name__', None) or repr(law)}"
+        return f"Simulator({self.design}; {self.observers!r}, {name}, num_envs={self.num_envs}, {spread(self.state.t)})"
 
     @property
     def t(self) -> FloatArray:

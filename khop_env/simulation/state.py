@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.observers import FloatArray, Memory
 from khop_env.physics import Links
 
@@ -21,6 +22,8 @@ class LinkState:
 
     weight: FloatArray
     age: FloatArray
+
+    __repr__ = brief
 
     @staticmethod
     def ideal(links: Links, num_envs: int) -> LinkState:
@@ -50,6 +53,8 @@ class SimulatorState:
     drawn: FloatArray
     memory: Memory
     links: LinkState
+
+    __repr__ = brief
 
     def arrays(self) -> dict[str, FloatArray]:
         """Every array that changes, by name; the observers' memory included."""

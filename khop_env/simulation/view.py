@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 import networkx as nx
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
 from khop_env.physics import Fleet, read_only
@@ -37,6 +38,8 @@ class View:
     edges: IntArray
     known: np.ndarray
     displacement: FloatArray
+
+    __repr__ = brief
 
     def known_edges(self) -> IntArray:
         """(N, B) number of each agent's task edges whose other agent it knows."""

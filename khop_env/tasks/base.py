@@ -16,6 +16,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
 from khop_env.physics import Fleet
 
@@ -46,6 +47,8 @@ class World:
     t: FloatArray
     x: FloatArray
     inputs: FloatArray
+
+    __repr__ = brief
 
     @property
     def fleet(self) -> Fleet:
