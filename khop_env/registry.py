@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-import khop_env.tasks
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
 from khop_env.extras import how_to_install
@@ -90,7 +89,7 @@ def find_task(environment: Environment) -> Task | type[Task]:
     found: Any = environment
     if isinstance(environment, str):
         if environment in ENVIRONMENTS:
-            found = getattr(khop_env.tasks, ENVIRONMENTS[environment])
+            found = load_object(ENVIRONMENTS[environment])
         elif is_object_name(environment):
             found = load_object(environment)
         else:
