@@ -76,7 +76,7 @@ def run(
     from khop_env.results import RunFileError, record, summarize, write_run
     from khop_env.results.metrics import finite
     from khop_env.scenarios.scenario import number_of_steps
-    from khop_env.simulation.simulator import parts_of_step
+    from khop_env.simulation.plant import parts_of_step
 
     explicit = integrator is IntegratorOption.EXPLICIT
     with mistakes(name), waiting(f"designing the observers of {name}"):

@@ -6,6 +6,7 @@ disturbances and users get views (B, ...) of them.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from khop_env.elementary import all_finite, weighted_sum
 from khop_env.observers import FloatArray, PlantState, SolveError
 from khop_env.physics import Fleet, read_only
 from khop_env.simulation.view import Law, ViewBuilder
+
+MOST_PARTS = 10_000
+"""Steps of the integrator that one `Simulator.step` may be divided into."""
 
 
 class FleetPlant:
@@ -97,3 +101,22 @@ def require_finite(x: FloatArray, fleet: Fleet) -> None:
             f"environment {env}: state {name!r} of {agent!r} became {x[column, env]}; check its agent model, the law "
             "and the disturbance, or take a shorter step if the plant itself diverged"
         )
+
+
+def parts_of_step(dt: float, longest: float, agent: str) -> int:
+    """Number of equal parts into which a step is divided, so that the plant's drift is stable in each of them.
+
+    Args:
+        dt: step in s.
+        longest: longest step for which the drift is stable (`Fleet.explicit_step`), in s.
+        agent: id of the agent with this drift, for the error.
+
+    Raises:
+        ValueError: for more than `MOST_PARTS`.
+    """
+    if dt > MOST_PARTS * longest:
+        raise ValueError(
+            f"dt = {dt:g} s is too long: the drift of {agent!r} takes {longest:.3g} s at a time, and no step is "
+            f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
+        )
+    return max(1, math.ceil(dt / longest))

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from khop_env.env.rendering.camera import Camera, Labels
 from khop_env.env.rendering.canvas import Canvas, Window
-from khop_env.env.rendering.panel import CIRCLE, Panel, draw_agent, draw_task_edge
+from khop_env.env.rendering.on_map import OnMap
+from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import (
     EDGE_COLOR,
     PALE,
@@ -241,7 +242,7 @@ class Renderer:
         self._draw_trails(canvas, t)
         hidden = self._draw_boxes(canvas, t, estimated)
         if decorate is not None:
-            decorate(_OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
+            decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
         self._draw_edges(canvas, middles)
         self._draw_agents(canvas, x, middles)
         self._draw_estimates(canvas, estimates, middles, estimate_pixels)
@@ -371,36 +372,3 @@ class Renderer:
                 canvas.line(np.array([middle, middles[visible[number]]]), SOFT, 0.75)
             text = self._names[visible[number]]
             canvas.text(text, tuple(middle), size, anchor=(0.5, 0.5), halo=True)
-
-
-class _OnMap:
-    """A `tasks.MapCanvas`: drawing in metres.
-
-    Args:
-        canvas: of the frame.
-        pixels: maps points (..., 2) in m to pixels.
-        meters: per pixel.
-        radius: of an agent's marker in pixels.
-    """
-
-    def __init__(
-        self, canvas: Canvas, pixels: Callable[[FloatArray], FloatArray], meters: float, radius: float
-    ) -> None:
-        self._canvas, self._pixels, self._meters, self._radius = canvas, pixels, meters, radius
-
-    def circle(self, center: FloatArray, radius: float, color: str, *, filled: bool = False) -> None:
-        """See `tasks.MapCanvas`."""
-        outline = min(radius / self._meters, 9999.0) * CIRCLE
-        width = 0.0 if filled else 1.5
-        self._canvas.marker(outline, self._pixels(np.asarray(center, float)), 0.0, color, width)
-
-    def line(self, points: FloatArray, color: str, width: float = 2.0) -> None:
-        """See `tasks.MapCanvas`."""
-        self._canvas.line(self._pixels(np.asarray(points, float)), color, width)
-
-    def cross(self, center: FloatArray, color: str) -> None:
-        """See `tasks.MapCanvas`."""
-        middle = self._pixels(np.asarray(center, float))
-        for end in ((1.0, 1.0), (1.0, -1.0)):
-            arm = 0.9 * self._radius * np.array(end)
-            self._canvas.line(np.array([middle - arm, middle + arm]), color, 2.0)
