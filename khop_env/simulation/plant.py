@@ -37,16 +37,17 @@ class FleetPlant:
         self.fleet, self.num_envs = fleet, num_envs
         self.disturbance, self.law, self.views = disturbance, law, views
         self._rates: tuple[FloatArray, ...] = ()
-        self._states = self._inputs = self._effects = np.zeros((0, 0))
+        self._states = self._inputs = self._effects = self._drawn = np.zeros((0, 0))
+        self._t = np.zeros(0)
         self._w = np.zeros((fleet.n, num_envs)).T  # (B, n) in the memory order of the states
 
     def rate(self, state: PlantState, out: FloatArray) -> None:
         """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
         states = self._bind(state)
-        self.fleet.drift(state.t, states, out.T)
+        self.fleet.drift(self._t, states, out.T)
         out += state.g
         if self.disturbance is not None:
-            out += self.disturbance(state.t, states, state.drawn, self._w).T
+            out += self.disturbance(self._t, states, self._drawn, self._w).T
 
     def stage(self, number: int, weights: FloatArray, elapsed: float, before: PlantState, state: PlantState) -> None:
         """Move `state` to stage `number`: `before` plus the rates so far times `weights`, `elapsed` seconds later.
@@ -67,22 +68,23 @@ class FleetPlant:
         Raises:
             ValueError: if the law returns inputs of a wrong shape.
         """
+        states = self._bind(state)
         if self.law is not None:
             assert self.views is not None
-            u = self.law(state.t, self.views.update(state.x, state.memory["estimate"]))
+            u = self.law(self._t, self.views.update(state.x, state.memory["estimate"]))
             if np.shape(u) != (self.num_envs, self.fleet.m):
                 raise ValueError(
                     f"law {self.law!r} returned inputs of shape {np.shape(u)}; expected (environments, inputs) = "
                     f"{(self.num_envs, self.fleet.m)}"
                 )
             state.u.T[:] = u
-        states = self._bind(state)
-        self.fleet.input_map(state.t, states, self._inputs, self._effects)
+        self.fleet.input_map(self._t, states, self._inputs, self._effects)
 
     def _bind(self, state: PlantState) -> FloatArray:
-        """The states (B, n) as models see them; views are made once, and again for the arrays of another state."""
+        """The states (B, n) as models see them; read-only views are made once, and again for another state's arrays."""
         if self._states.base is not state.x:
             self._states, self._inputs = read_only(state.x.T), read_only(state.u.T)
+            self._t, self._drawn = read_only(state.t[:]), read_only(state.drawn[:])
             self._effects = state.g.T
         return self._states
 
