@@ -9,7 +9,7 @@ from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import Policy
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
-from khop_env.objects import is_object_name, load_object
+from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
 from khop_env.registry import environments, parameters_from_text
 
@@ -67,7 +67,7 @@ def make_policy(spec: str) -> Policy:
 
 def _policy_of_your_own(spec: str) -> Policy:
     found = load_object(spec)
-    policy = found() if isinstance(found, type) else found
+    policy = called(spec, found) if isinstance(found, type) else found
     if not (callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None))):
         raise ValueError(
             f"policy {spec!r}: a policy has reset(env, seeds) and act(observations); got {type(policy).__name__}"

@@ -24,11 +24,12 @@ class EnvDescription:
     Attributes:
         environment: e.g. "consensus_v0".
         scenario: name of the scenario.
-        observe: what stands in the slots of agents out of earshot.
+        observe: what the slots of agents beyond the neighbours hold.
         control_period: time between actions in s.
         models: the model of each agent that acts, by id, in the environment's order.
         layouts: what each agent's observation holds.
         action_sizes: entries of each agent's action, padding included.
+        error_unit: unit of the task error.
     """
 
     environment: str
@@ -38,6 +39,7 @@ class EnvDescription:
     models: Mapping[str, AgentModel]
     layouts: Mapping[str, ObservationLayout]
     action_sizes: Mapping[str, int]
+    error_unit: str = "m"
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -85,6 +87,7 @@ def describe(env: object) -> EnvDescription:
         models={agent: fleet.models[fleet.agent(agent)] for agent in batched.agents},
         layouts=dict(zip(batched.agents, batched.layouts, strict=True)),
         action_sizes=dict(zip(batched.agents, sizes.tolist(), strict=True)),
+        error_unit=batched.task.error_unit(batched.world),
     )
 
 

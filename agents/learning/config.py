@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from agents.learning.fingerprint import plain
 from khop_env.registry import Environment, find_task
 from khop_env.scenarios import Scenario
 from khop_env.simulation import OBSERVE, Observe
@@ -22,10 +24,10 @@ class TrainingConfig:
 
     Attributes:
         environment: one of `khop_env.environments()`, or a task of your own.
-        scenario: name, path or `Scenario`; None for the environment's own.
+        scenario: what `khop_env.scenario` takes, or a `Scenario`; None for the environment's own.
         observe: "estimate", "oracle" or "local".
         bounds: whether observations hold the guaranteed bounds.
-        rates: whether networks are shown how fast positions change, as differences of observations.
+        rates: whether networks get how fast positions change, too, as differences of observations.
         algorithm: "ppo" or "sac".
         per_type: a network for each type of agent instead of one for all.
         timesteps: agent-steps, over all environments.
@@ -33,16 +35,17 @@ class TrainingConfig:
         num_envs: copies of the environment, each of N agents.
         hidden: widths of the networks' layers.
         learning_rate: at the beginning; falls linearly to 0 with "ppo".
-        gamma: discount per control period.
-        gae_lambda: of the advantage estimates; PPO.
+        gamma: discount per control period, from 0 to 1.
+        gae_lambda: of the generalised advantage estimates, from 0 to 1; PPO.
         n_steps: control periods between updates; PPO.
         batch_size: samples in a gradient step.
         n_epochs: passes over the samples of an update; PPO.
-        clip_range: PPO.
+        clip_range: how far an update may change the probability of an action, as a fraction; PPO.
         entropy: weight of the entropy bonus; PPO.
         log_std: logarithm of the initial standard deviation of actions; PPO.
-        huber: task error in m from which the training reward is linear in it; evaluation stays quadratic.
+        huber: task error, in its unit, from which the training reward is linear in it; evaluation stays quadratic.
         evaluations: how often the policy is evaluated on fixed seeds, and saved.
+        arguments: others of the environment's by name, e.g. {"control_period": 0.1, "reward": "team"}.
 
     Raises:
         ValueError: naming the attribute, what was given and what is expected.
@@ -70,9 +73,14 @@ class TrainingConfig:
     log_std: float = 0.5
     huber: float = 1.0
     evaluations: int = 20
+    arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
+        object.__setattr__(self, "arguments", dict(self.arguments))
+        for name in ("observe", "bounds", "num_envs", "scenario"):
+            if name in self.arguments:
+                raise ValueError(f"arguments: {name!r} is a setting of its own, {name}={self.arguments[name]!r}")
         if self.algorithm not in ALGORITHMS:
             raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
         if self.observe not in OBSERVE:
@@ -101,4 +109,5 @@ class TrainingConfig:
         values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
         name = self.scenario.name if isinstance(self.scenario, Scenario) else self.scenario and str(self.scenario)
         environment = self.environment if isinstance(self.environment, str) else find_task(self.environment).name
-        return {**values, "environment": environment, "scenario": name, "hidden": list(self.hidden)}
+        changed = {"environment": environment, "scenario": name, "hidden": list(self.hidden)}
+        return {**values, **changed, "arguments": plain(self.arguments)}

@@ -26,11 +26,12 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
         num_envs: copies; those of the run by default.
 
     Raises:
-        ValueError: for an unknown environment or scenario.
+        ValueError: for an unknown environment or scenario, or a wrong argument of the environment.
     """
     where = {} if config.scenario is None else {"scenario": config.scenario}
     count = config.num_envs if num_envs is None else num_envs
-    return make_batched(config.environment, **where, num_envs=count, observe=config.observe, bounds=config.bounds)
+    of_config: dict[str, Any] = {"observe": config.observe, "bounds": config.bounds}
+    return make_batched(config.environment, **where, num_envs=count, **of_config, **config.arguments)
 
 
 class TrainingVecEnv(VecEnvWrapper):

@@ -48,6 +48,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
     theirs = saved.get("config")
     if not isinstance(theirs, dict) or not isinstance(theirs.get("timesteps"), int) or "fingerprint" not in saved:
         raise CheckpointError(f"{path} isn't a checkpoint that khop train wrote (it has no settings)")
+    theirs = {"arguments": {}, **theirs}  # runs of earlier versions had none
     differs = [key for key in ours if theirs.get(key) != ours[key]]
     if theirs["timesteps"] < config.timesteps:
         differs.remove("timesteps")

@@ -56,7 +56,7 @@ def _maker(name: str, scenario: str | None) -> tuple[Callable[[], Any] | Any, st
     Raises:
         ValueError: if there is none of that name, or if making it raises.
     """
-    from khop_env.objects import described, load_object
+    from khop_env.objects import called, load_object
     from khop_env.physics import did_you_mean
     from khop_env.registry import environments, make
     from khop_env.tasks import Task
@@ -75,9 +75,5 @@ def _maker(name: str, scenario: str | None) -> tuple[Callable[[], Any] | Any, st
         raise ValueError(f"--scenario is for environments that khop list names and for tasks; {name} has its own")
     found = getattr(found, "parallel_env", found)
     if callable(found):
-        try:
-            found()
-        except Exception as error:
-            file = getattr(sys.modules.get(found.__module__), "__file__", None) or ""
-            raise ValueError(f"{name} raised {described(error, file)}") from error
+        called(name, found)
     return found, name

@@ -23,6 +23,13 @@ MOST_ROWS = 5_000_000
 _TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.07000000000000001
 
 
+class StoppedError(RuntimeError):
+    """What is recorded can't go on, for a reason that isn't the observers' or the plant's."""
+
+
+Failure = FunnelError | SolveError | StoppedError
+
+
 @dataclass(frozen=True, eq=False)
 class ObserverRecord:
     """The samples of one kind of observer: of the states (PPSO), or of the inputs' effects g (PPIO).
@@ -92,7 +99,7 @@ class Recording:
     extremes: Extremes
     steps: int
     wall_time: float
-    error: FunnelError | SolveError | None = None
+    error: Failure | None = None
     task_error: FloatArray | None = None
 
     @property
@@ -118,6 +125,7 @@ def record(
     *,
     samples_per_second: float = 100.0,
     task_error: Callable[[], float] | None = None,
+    ended: Callable[[], bool] | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Run the simulator from where it stands to `duration`, and keep samples of everything.
@@ -131,7 +139,8 @@ def record(
         samples_per_second: at most this many; fewer where the steps are longer, or the fleet is so large that more
             than `MOST_ROWS` numbers would be kept in an array.
         task_error: sampled, too, if given: the error of the task that is played.
-        progress: told now and then how far it is.
+        ended: whether the episode is over before its time, asked after every step.
+        progress: called now and then with how far it is.
 
     Returns:
         The recording. Where the integrator gave up midway, `Recording.error` says why, and all samples before stand.
@@ -150,7 +159,7 @@ def record(
     most_samples = max(2, MOST_ROWS // width)
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
     samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error)
-    error: FunnelError | SolveError | None = None
+    error: Failure | None = None
     with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError does, and a summary says what ran away
         simulator.warm_up()
         start = shown = clock.perf_counter()
@@ -161,12 +170,15 @@ def record(
                 until = duration if k == steps else round(k * dt, _TIME_DECIMALS)
                 simulator.step(until - float(simulator.t[0]))
                 done = k
-                if k % stride == 0 or k == steps:
+                over = ended is not None and ended()
+                if k % stride == 0 or k == steps or over:
                     samples.take()
+                if over:
+                    break
                 if progress is not None and (now := clock.perf_counter()) - shown > 0.1:
                     shown = now
                     progress(k / steps)
-        except (FunnelError, SolveError) as stopped:  # the state is the one before the step: worth keeping
+        except (FunnelError, SolveError, StoppedError) as stopped:  # the state is the one before the step
             error = stopped
             if done % stride:
                 samples.take()
@@ -201,7 +213,7 @@ class _Samples:
             self._arrays[name][self._taken] = read()
         self._taken += 1
 
-    def recording(self, steps: int, wall_time: float, error: FunnelError | SolveError | None) -> Recording:
+    def recording(self, steps: int, wall_time: float, error: Failure | None) -> Recording:
         design = self._simulator.design
         kept = {name: values[: self._taken] for name, values in self._arrays.items()}
         time = kept["time"][:, 0]
