@@ -103,25 +103,40 @@ def print_table(
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        show_edge=False,
-        collapse_padding=True,
-    )
-    needed = 2 * (len(header) - 1)  # between columns
-    for number, name in enumerate(header):
-        cells = [name, *(row[number] for row in rows)]
-        longest = max(len(word) for text in cells for word in ([text] if name in whole else [*text.split(), ""]))
-        needed += longest
-        table.add_column(name, overflow="fold", min_width=longest, no_wrap=name in whole)
+    columns = [[name, *(row[number] for row in rows)] for number, name in enumerate(header)]
+    lengths = [[max(map(len, ["", *cell.splitlines()])) for cell in cells] for cells in columns]
+    words = [max(len(word) for cell in cells for word in [*cell.split(), ""]) for cells in columns]
+    least = [max(full) if name in whole else few for name, full, few in zip(header, lengths, words, strict=True)]
+    available = Console().width if sys.stdout.isatty() else width
+    widths = _narrowed(lengths, least, available - 2 * (len(header) - 1))
+    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.pad_edge, table.show_edge = False, False
+    for name, chosen in zip(header, widths, strict=True):
+        table.add_column(name, width=chosen, overflow="fold")
     for row in rows:
         table.add_row(*row)
-    available = Console().width if sys.stdout.isatty() else width
-    Console(width=max(available, needed), markup=False, highlight=False).print(table)
+    total = max(available, sum(widths) + 2 * len(widths))
+    Console(width=total, markup=False, highlight=False).print(table)
+
+
+def _narrowed(lengths: Sequence[Sequence[int]], least: Sequence[int], room: int) -> list[int]:
+    """Widths of columns that fit into `room` as far as their least widths let them.
+
+    Columns whose header alone is folded are narrowed first, then those with fewest folded cells, then the widest.
+
+    Args:
+        lengths: of each column's cells, the header first.
+        least: width of each column.
+        room: for all.
+    """
+    widths = [max(cells) for cells in lengths]
+
+    def cost(q: int) -> tuple[int, int]:
+        return sum(length >= widths[q] for length in lengths[q][1:]), -widths[q]
+
+    while sum(widths) > room and (rest := [q for q in range(len(widths)) if widths[q] > least[q]]):
+        widths[min(rest, key=cost)] -= 1
+    return widths
 
 
 def print_text(text: str) -> None:

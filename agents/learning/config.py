@@ -23,20 +23,20 @@ class TrainingConfig:
     """Every choice of a training run; the defaults are those that worked on every task of the library.
 
     Attributes:
-        environment: one of `khop_env.environments()`, or a task of your own.
+        environment: name of an environment (khop list), or a task of your own.
         scenario: what `khop_env.scenario` takes, or a `Scenario`; None for the environment's own.
-        observe: "estimate", "oracle" or "local".
+        observe: states of agents beyond the neighbours: "estimate", "oracle" or "local".
         bounds: whether observations hold the guaranteed bounds.
         rates: whether networks get how fast positions change, too, as differences of observations.
-        algorithm: "ppo" or "sac".
+        algorithm: learning algorithm, "ppo" or "sac".
         per_type: a network for each type of agent instead of one for all.
-        timesteps: agent-steps, over all environments.
-        seed: of networks, environments and exploration.
+        timesteps: agent-steps in all, of all copies together.
+        seed: seed of networks, episodes and exploration.
         num_envs: copies of the environment, each of N agents.
         hidden: widths of the networks' layers.
-        learning_rate: at the beginning; falls linearly to 0 with "ppo".
+        learning_rate: learning rate at the beginning; falls linearly to 0 with "ppo".
         gamma: discount per control period, from 0 to 1.
-        gae_lambda: of the generalised advantage estimates, from 0 to 1; PPO.
+        gae_lambda: lambda of the generalised advantage estimates, from 0 to 1; PPO.
         n_steps: control periods between updates; PPO.
         batch_size: samples in a gradient step.
         n_epochs: passes over the samples of an update; PPO.
@@ -45,7 +45,7 @@ class TrainingConfig:
         log_std: logarithm of the initial standard deviation of actions; PPO.
         huber: task error, in its unit, from which the training reward is linear in it; evaluation stays quadratic.
         evaluations: how often the policy is evaluated on fixed seeds, and saved.
-        arguments: others of the environment's by name, e.g. {"control_period": 0.1, "reward": "team"}.
+        arguments: further arguments of the environment by name, e.g. {"control_period": 0.1, "reward": "team"}.
 
     Raises:
         ValueError: naming the attribute, what was given and what is expected.

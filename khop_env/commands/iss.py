@@ -49,8 +49,9 @@ def iss(
         if duration is not None:
             scenario = scenario.replace(duration=duration)
         gain = analytical_gain(scenario)
-        configuration = {"scenario": scenario.name, "law": scenario.law.name, "episodes": episodes, "seed": seed}
-        configuration["content"] = digest(scenario, sources(scenario.models))
+        configuration: dict[str, Any] = {"scenario": scenario.name, "law": scenario.law.name, "episodes": episodes}
+        configuration |= {"seed": seed, "duration": scenario.duration}
+        configuration["scenario_content"] = digest(scenario, sources(scenario.models))
         default = Path("runs") / "iss" / folder_name(scenario.name, scenario.law.name, f"seed{seed}")
         folder = choose_folder(default, out, configuration)
     measured: dict[str, list[dict[str, Any]]] = {"injected": [], "swept": []}
@@ -107,11 +108,8 @@ def iss(
                 f"analytical gain: for distances up to {region:.3g} {unit}; it says something of {checked} of "
                 f"{len(injected) + len(swept)} rows, and {verdict}"
             )
-        if tables := [str(files[key]) for key in ("injected", "swept") if key in files]:
-            typer.echo(f"tables: {', '.join(tables)}")
-        for key in ("summary", "figure"):
-            if key in files:
-                typer.echo(f"{key}: {files[key]}")
+        for key, path in files.items():
+            typer.echo(f"{key}: {path}")
     if unfinished is not None:
         why, status = unfinished
         say(f"khop: {why}; above are the rows that were measured until then")

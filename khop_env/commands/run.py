@@ -213,7 +213,9 @@ def _resolved(name: str, elsewhere: str | None) -> tuple[Task | type[Task] | Non
     if task is not None:
         return task, load(elsewhere or task.default_scenario)
     if elsewhere is not None:
-        raise ValueError(f"--scenario is for environments, and {name!r} isn't one; {did_you_mean(name, environments())}")
+        raise ValueError(
+            f"--scenario is for environments, and {name!r} isn't one; {did_you_mean(name, environments())}"
+        )
     known = (*SCENARIOS, *environments())
     nearest = did_you_mean(name, known)
     if name.isidentifier() and name not in known and any(repr(one) in nearest for one in environments()):

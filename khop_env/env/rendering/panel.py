@@ -74,7 +74,7 @@ class Panel:
         driven: str | None,
         task: bool,
         observer: tuple[str, Look] | None,
-        error_label: str = "mean task error",
+        error_label: str = "task error",
         error_unit: str = "m",
     ) -> None:
         self._left, self._top, self._width, _ = rect

@@ -72,7 +72,7 @@ class Renderer:
         driven_label: str = "driven agent",
         observer: int | None = None,
         title: str = "",
-        error_label: str = "mean task error",
+        error_label: str = "task error",
         error_unit: str | None = None,
         size: tuple[int, int] = (900, 720),
     ) -> None:
