@@ -63,7 +63,7 @@ def called(name: str, function: Callable[..., Result], *arguments: Any, **keywor
     try:
         return function(*arguments, **keywords)
     except Exception as error:
-        file = getattr(sys.modules.get(function.__module__), "__file__", None) or ""
+        file = getattr(sys.modules.get(getattr(function, "__module__", "")), "__file__", None) or ""
         raise ValueError(f"{name} raised {described(error, file)}") from error
 
 

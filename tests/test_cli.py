@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import khop_env
 from khop_env import __version__
-from khop_env.cli import app
+from khop_env.cli import COMMANDS, app
 
 
 def khop(*arguments: str, status: int = 0):
@@ -84,7 +84,7 @@ def test_tables_fit_80_columns_and_break_between_words(arguments, folder):
     if arguments[0] == "evaluate":
         assert {"linear:gain=2,", "cancel_drift=true", "ppo:pretrained", "oracle"} <= set(found.split())
         assert found.count("±") == 11  # six returns, five differences
-        assert any(line.rstrip().endswith("bound") for line in found.splitlines()[1:3])  # the last column
+        assert any(line.rstrip().endswith("bound") for line in found.partition("──")[0].splitlines())  # the last column
     if arguments[0] == "check":
         words = set(found.split())
         report = only_json(khop(*arguments, "--json"))
@@ -413,6 +413,17 @@ class TestBench:
 
 def test_version():
     assert khop("--version").stdout == f"{__version__}\n"
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_is_folded_between_words(command, monkeypatch):
+    """Paragraphs fill their lines, and nothing is cut off with an ellipsis."""
+    monkeypatch.setenv("COLUMNS", "80")
+    found = khop(command, "--help").stdout
+    assert max(map(len, found.splitlines())) <= 80
+    assert "…" not in found
+    paragraphs = " ".join(found.partition("╭")[0].split())
+    assert " ".join(COMMANDS[command].__doc__.split()) in paragraphs
 
 
 def test_help_names_every_command():

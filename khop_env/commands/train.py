@@ -58,7 +58,7 @@ def train(
     algo: Annotated[AlgorithmOption | None, typer.Option(help="Algorithm; by default ppo.")] = None,
     per_type: Annotated[bool | None, typer.Option("--per-type", help="One network for each type of agent.")] = None,
     timesteps: Annotated[
-        int | None, typer.Option(min=1, help="Agent-steps of all copies together; by default 2 000 000.")
+        int | None, typer.Option(min=1, help="Agent-steps of all copies together; by default 2000000.")
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of networks, episodes and exploration; by default 0.")
@@ -83,7 +83,7 @@ def train(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder; by default its name says what is trained: runs/train/consensus_v0-estimate-ppo-0."),
+        typer.Option(help="Folder; by default in runs/train/, named after environment, algorithm and seed."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the folder's last checkpoint.")] = False,
     as_json: JsonOption = False,

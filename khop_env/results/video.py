@@ -62,7 +62,7 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Film a run: agents, edges, and what one agent believes of those it can't hear.
+    """Film a run: agents, edges, and one agent's estimates of those beyond its neighbours.
 
     The film has `fps` frames for each second it lasts, each showing the sample that is nearest in time, and the
     last one the end. Where the recording has fewer samples a second, some are shown twice.
@@ -71,18 +71,19 @@ def write_video(
         recording: of the run.
         scenario: what was run.
         path: of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
-        observer: id or index of the agent whose beliefs are shown; by default the one with most task edges to agents
-            that it can't hear.
-        env: the environment that was played, for its task; by default agreement along the scenario's task graph.
+        observer: id or index of the agent whose estimates are drawn; by default the one with most task edges to
+            agents beyond its neighbours.
+        env: the environment that was played, for its task and the mean of its task error; by default agreement along
+            the scenario's task graph, with the consensus error |Pi p|.
         fps: frames per second, up to 50.
         speed: seconds of the run per second of the film.
-        progress: told now and then how far it is.
+        progress: called now and then with how far it is.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: for an ending, an observer, an fps or a speed that won't do.
+        ValueError: for a wrong ending, observer, fps or speed.
         ModuleNotFoundError: if a package is missing; the message says what to install.
         OSError: if the file can't be written; nothing is left in its place.
     """
