@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
 from khop_env.extras import how_to_install
-from khop_env.objects import is_object_name, load_object
+from khop_env.objects import called, is_object_name, load_object
 from khop_env.observers import Proximal
 from khop_env.physics import did_you_mean
 from khop_env.scenarios.convoy import convoy
@@ -84,7 +84,7 @@ def find_task(environment: Environment) -> Task | type[Task]:
 
     Raises:
         TypeError: if `environment` is neither a name nor a task.
-        ValueError: for an unknown environment; the message suggests the closest name.
+        ValueError: for an unknown environment, with the closest name, or a name under which something else is found.
     """
     found: Any = environment
     if isinstance(environment, str):
@@ -95,6 +95,8 @@ def find_task(environment: Environment) -> Task | type[Task]:
         else:
             raise ValueError(f"no environment {environment!r}; {did_you_mean(environment, ENVIRONMENTS)}")
     if not (isinstance(found, Task) or (isinstance(found, type) and issubclass(found, Task))):
+        if isinstance(environment, str):
+            raise ValueError(f"{environment} should be a Task, a class or an object; got {type(found).__name__}")
         raise TypeError(f"expected an environment's name or a Task; got {found!r} ({type(found).__name__})")
     return found
 
@@ -344,7 +346,7 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
     name, _, settings = text.partition(":")
     if name not in SCENARIOS and is_object_name(text):
         found = load_object(text)
-        made = found(**parameters) if callable(found) else found
+        made = called(text, found, **parameters) if callable(found) else found
         if not isinstance(made, Scenario):
             raise ValueError(
                 f"{text} should be a Scenario or a function that returns one, e.g. my_file.py:my_scenario; got "
