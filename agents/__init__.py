@@ -1,4 +1,4 @@
-"""THE DECISIONS: observation to action. Feedback laws, policies, and their evaluation."""
+"""Policies for khop_env, from observation to action: feedback laws, learned policies, and their evaluation."""
 
 from agents.comparison import Comparison, Row, compare, interval95
 from agents.consensus import LinearConsensus, TanhConsensus

@@ -1,29 +1,32 @@
-"""The same work as tasks on a Ray cluster."""
+"""Run independent tasks on a Ray cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from khop_env.extras import how_to_install
+
 
 def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-    """Number and result of each task, as they come; tasks lost with a machine are run again by Ray, three times.
+    """Yield the index and result of each task in order of completion.
 
-    A cluster that is running is used (Ray looks for its address in RAY_ADDRESS, then on this machine); otherwise Ray
-    starts one on this machine, which ends with the last result.
+    Ray runs a task that was lost with a machine again, up to three times. An existing cluster is used (Ray reads its
+    address from RAY_ADDRESS, then looks on this machine); otherwise Ray starts a local one, which is shut down after
+    the last result.
 
     Args:
-        function: what to run; each task gets a copy of it, and the workers need khop_env installed.
-        tasks: its arguments.
+        function: called with each task; every call gets a copy of it, and the workers need khop_env installed.
+        tasks: arguments of `function`.
 
     Raises:
-        ModuleNotFoundError: without Ray.
-        ValueError: what `function` raises for a task.
+        ModuleNotFoundError: if Ray isn't installed.
+        ValueError: if `function` raises it for a task.
     """
     try:
         import ray
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("a Ray cluster needs Ray: pip install 'khop_env[ray]'") from error
+        raise ModuleNotFoundError(f"a Ray cluster needs Ray: {how_to_install('ray')}") from error
 
     started = not ray.is_initialized()
     if started:

@@ -1,4 +1,4 @@
-"""A table of policies and observation modes over the same episodes, on one core, several, or a Ray cluster."""
+"""Compare policies and observation modes over the same episodes, in one process, several, or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from agents.learning.learned import LearnedPolicy
 from agents.policies import make_policy
 from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
+from khop_env.brief import brief
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 from khop_env.registry import Environment, make_batched
@@ -29,60 +30,62 @@ from khop_env.simulation import Observe
 if TYPE_CHECKING:
     import polars as pl
 
-CHUNK = 25  # episodes played at once; fixed, so that no number depends on who plays how many
+CHUNK = 25  # episodes per batch; fixed, so that results don't depend on the number of workers
 
 _Task = tuple[str, Observe, bool, tuple[int, ...]]  # policy, observation mode, with bounds, seeds
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One policy under one observation mode.
+    """Results of one policy under one observation mode.
 
     Attributes:
-        policy: as it was asked for.
-        env: where it played.
-        episodes: what was measured.
+        policy: the policy's name as requested.
+        env: description of the environment it acted in.
+        episodes: measurements of its episodes.
     """
 
     policy: str
     env: EnvDescription
     episodes: Episodes
 
+    __repr__ = brief
+
     @property
     def observe(self) -> Observe:
-        """The mode."""
+        """The observation mode."""
         return self.env.observe
 
     @property
     def label(self) -> str:
-        """E.g. "tanh on estimate"."""
+        """Policy and observation mode, e.g. "tanh on estimate"."""
         return f"{self.policy} on {self.observe}"
 
     def summary(self) -> dict[str, Any]:
-        """The row in a few numbers; a settling time that isn't finite is None."""
-        seen = self.episodes
+        """Means, medians and extremes over the episodes; a settling time that isn't finite is None."""
+        episodes = self.episodes
         return {
             "policy": self.policy,
             "observe": self.observe,
-            "mean_return": float(seen.returns.mean()),
-            "ci95": interval95(seen.returns),
-            "final_task_error": float(seen.final_task_error.mean()),
-            "settling_time": finite(float(np.median(seen.settling_time))),
-            "effort": float(seen.effort.mean()),
-            "max_normalized_disagreement": float(seen.max_normalized_disagreement.max()),
-            "max_error_to_bound": float(seen.max_error_to_bound.max()),
+            "mean_return": float(episodes.returns.mean()),
+            "ci95": interval95(episodes.returns),
+            "final_task_error": float(episodes.final_task_error.mean()),
+            "settling_time": finite(float(np.median(episodes.settling_time))),
+            "effort": float(episodes.effort.mean()),
+            "max_normalized_disagreement": float(episodes.max_normalized_disagreement.max()),
+            "max_error_to_bound": float(episodes.max_error_to_bound.max()),
         }
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Rows over the same episodes.
+    """Results of several policies and observation modes over the same episodes.
 
     Attributes:
-        environment: its name.
-        scenario: its name.
-        planned: episodes of each row; rows that were interrupted have fewer, or are missing.
-        rows: in the order asked for.
+        environment: name of the environment.
+        scenario: name of the scenario.
+        planned: number of episodes requested per row; after an interrupt rows may have fewer, or be missing.
+        rows: in the requested order.
     """
 
     environment: str
@@ -90,25 +93,31 @@ class Comparison:
     planned: int
     rows: list[Row] = field(default_factory=list)
 
+    __repr__ = brief
+
     def summary(self) -> dict[str, Any]:
-        """Everything that `khop evaluate --json` prints; rows with fewer episodes than planned say how many."""
-        rows = [row.summary() for row in self.rows]
-        for row, seen in zip(self.rows, rows, strict=True):
+        """The output of `khop evaluate --json`; a row with fewer episodes than planned has the key `episodes`."""
+        summaries = [row.summary() for row in self.rows]
+        for row, summary in zip(self.rows, summaries, strict=True):
             if len(row.episodes.seed) < self.planned:
-                seen["episodes"] = len(row.episodes.seed)
-        where = {"environment": self.environment, "scenario": self.scenario, "episodes": self.planned}
-        unit = self.rows[0].env.error_unit if self.rows else None
-        return {**where, "task_error_unit": unit, "rows": rows}
+                summary["episodes"] = len(row.episodes.seed)
+        return {
+            "environment": self.environment,
+            "scenario": self.scenario,
+            "episodes": self.planned,
+            "task_error_unit": self.rows[0].env.error_unit if self.rows else None,
+            "rows": summaries,
+        }
 
     def difference(self, row: Row) -> tuple[float, float | None]:
-        """How much more a row returns than the first, paired by episode, and the half width of the 95 % interval."""
+        """Mean difference in return from the first row, paired by episode, and half width of its 95 % interval."""
         first = self.rows[0].episodes.returns
-        both = min(len(row.episodes.returns), len(first))
-        more = row.episodes.returns[:both] - first[:both]
-        return float(more.mean()), interval95(more)
+        paired = min(len(row.episodes.returns), len(first))
+        differences = row.episodes.returns[:paired] - first[:paired]
+        return float(differences.mean()), interval95(differences)
 
     def frame(self) -> pl.DataFrame:
-        """A tidy data frame, one row per policy, mode and episode."""
+        """A tidy data frame with one row per policy, observation mode and episode."""
         import polars as pl
 
         return pl.concat(row.episodes.frame(row.policy, row.env) for row in self.rows)
@@ -126,36 +135,39 @@ def compare(
     arguments: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Play every policy under every observation mode over the same episodes.
+    """Run every policy under every observation mode over the same episodes.
 
     Args:
         environment: one of `khop_env.environments()`, or a task of your own.
-        policies: names that `make_policy` knows.
+        policies: names understood by `make_policy`.
         observe: observation modes.
-        scenario: a scenario, its name or path; the environment's default if left out. A file is read once.
-        seeds: one per episode.
-        workers: processes; the numbers don't depend on how many.
-        ray: play on a Ray cluster instead (the one that is running, or a local one).
-        arguments: others of the environment's, e.g. {"max_cycles": 100}. A learned policy that was trained with bounds
-            in its observations gets them anyhow.
-        progress: told how far it is.
+        scenario: a scenario, its name or path; by default the environment's own. A file is read once.
+        seeds: one seed per episode.
+        workers: number of processes; results don't depend on it.
+        ray: run on a Ray cluster instead (an existing one, or a local one).
+        arguments: further arguments of the environment, e.g. {"max_cycles": 100}. A learned policy that was trained
+            with bounds in its observations always gets them.
+        progress: called with the completed fraction.
 
     Raises:
-        ValueError: for anything unknown, before a policy plays.
-        ModuleNotFoundError: for `ray` without Ray.
-        UnfinishedError: if a policy or a worker fails while it plays; it holds what was played until then.
-        Interrupted: a KeyboardInterrupt that holds the same; workers have ended.
+        ValueError: if an argument is unknown or invalid, before the first episode.
+        ModuleNotFoundError: if `ray` is set and Ray isn't installed.
+        UnfinishedError: if a policy or a worker fails; its `partial` holds the results until then.
+        Interrupted: on Ctrl-C, with the same `partial`; the workers have ended.
     """
     if not len(seeds):
-        raise ValueError("there is nothing to play without seeds; give one per episode, e.g. range(100)")
-    for name, several in (("policies", policies), ("observe", observe)):
-        if isinstance(several, str):
-            raise ValueError(f"{name} is a list of names, e.g. [{several!r}]; got {several!r}")
+        raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
+    for name, names in (("policies", policies), ("observe", observe)):
+        if isinstance(names, str):
+            raise ValueError(f"{name} must be a list of names, e.g. [{names!r}]; got {names!r}")
     if not policies or not observe or len(set(observe)) < len(observe):
-        raise ValueError(f"name at least one policy and one observation mode, each once; got {list(observe)}")
+        raise ValueError(
+            f"expected at least one policy and one observation mode, no mode twice; got policies={list(policies)} and "
+            f"observe={list(observe)}"
+        )
     player = _Player(environment, chosen_scenario(environment, scenario), arguments or {})
     rows: list[tuple[str, EnvDescription, bool]] = []
-    for spec in policies:  # refuses what doesn't fit before anything is played
+    for spec in policies:  # check that each policy fits before the first episode
         policy = make_policy(spec)
         bounds = isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
         for mode in observe:
@@ -170,12 +182,12 @@ def compare(
     results: list[Episodes | None] = [None] * len(tasks)
 
     def comparison() -> Comparison:
-        found = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds))
+        result = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds))
         for number, (spec, env, _) in enumerate(rows):
             parts = list(itertools.takewhile(bool, results[number * len(chunks) : (number + 1) * len(chunks)]))
             if parts:
-                found.rows.append(Row(spec, env, Episodes.joined(parts)))  # type: ignore[arg-type]
-        return found
+                result.rows.append(Row(spec, env, Episodes.joined(parts)))  # type: ignore[arg-type]
+        return result
 
     try:
         with contextlib.closing(_run(player, tasks, workers, ray)) as played:
@@ -210,7 +222,7 @@ def interval95(values: FloatArray) -> float | None:
 
 
 class _Player:
-    """Plays tasks, in environments that are made once for each kind of observation, and belong to this object alone."""
+    """Runs tasks; builds one environment per observation mode and arguments, never shared with another object."""
 
     def __init__(self, environment: Environment, scenario: Scenario, arguments: Mapping[str, Any]) -> None:
         self._environment, self._scenario, self._arguments = environment, scenario, dict(arguments)
@@ -235,7 +247,7 @@ class _Player:
 def _run(
     player: _Player, tasks: Sequence[_Task], workers: int, ray: bool
 ) -> Generator[tuple[int, Episodes], None, None]:
-    """Number and result of each task, as they come."""
+    """Yield the index and result of each task in order of completion."""
     if ray:
         from agents.cluster import run_on_ray
 

@@ -13,13 +13,13 @@ from khop_env.simulation import View
 
 @dataclass
 class TanhConsensus(VelocityLaw):
-    """v_i = k_c sum over task edges of tanh(p_j - p_i - d_ij), component by component, p_j as heard or estimated.
+    """v_i = k_c sum over task edges of tanh(p_j - p_i - d_ij), component by component, p_j true or estimated.
 
     The paper's u_i, with the task's displacements d_ij (zero in consensus). Goal set A: p_j - p_i = d_ij on all task
     edges. In consensus set-ISS with respect to A, for a common Lipschitz drift, a connected task graph and commands
     below the input limits, in the region of `ComparisonGain`, which derives the gain gamma; without drift in the whole
-    space for small errors, and then with displacements, too. With displacements and a drift A isn't invariant, since
-    agents that stand apart drift differently: measured only. Other models (carts, unicycles, vessels) follow the
+    space for small errors, and then also with displacements. With displacements and a drift A isn't invariant, since
+    drifts differ between positions: measured only. Other models (carts, unicycles, vessels) follow the
     commanded velocity with their own controllers: measured only.
 
     Attributes:
@@ -32,26 +32,26 @@ class TanhConsensus(VelocityLaw):
         self.require_positive("gain")
 
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
-        """The sum of bounded pulls."""
+        """The gain times the sum of tanh of the displacements."""
         sum_edges(self.gain, True, view.edges, displacement, velocity)
 
     def speed_limit(self, most_edges: int) -> float:
-        """Each edge pulls by less than the gain."""
+        """The gain per edge, since |tanh| < 1."""
         return self.gain * most_edges
 
     def set_iss_gain(self, scenario: Scenario) -> ComparisonGain | None:
-        """The analytical gain on a scenario, or None where it is measured only."""
+        """The analytical gain on a scenario, or None if none can be derived."""
         return consensus_gain(scenario, self.gain, bounded=True)
 
 
 @dataclass
 class LinearConsensus(VelocityLaw):
-    """v_i = k sum over task edges of (p_j - p_i - d_ij), cut off at the input limits.
+    """v_i = k sum over task edges of (p_j - p_i - d_ij), clipped at the input limits.
 
     The standard protocol (R. Olfati-Saber and R. M. Murray, IEEE Trans. Automatic Control 49(9), 2004) with saturation.
     Goal set A as for `TanhConsensus`. In consensus set-ISS with respect to A, for agents with a common Lipschitz drift
     and a connected task graph, while no input saturates: `ComparisonGain` derives the linear gain and its region;
-    without drift with displacements, too. Beyond it, with displacements under a drift, with the drift cancelled, and
+    without drift also with displacements. Beyond it, with displacements under a drift, with the drift cancelled, and
     for models with other inputs: measured only.
 
     Attributes:
@@ -66,9 +66,9 @@ class LinearConsensus(VelocityLaw):
         self.require_positive("gain")
 
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
-        """The sum of displacements."""
+        """The gain times the sum of the displacements."""
         sum_edges(self.gain, False, view.edges, displacement, velocity)
 
     def set_iss_gain(self, scenario: Scenario) -> ComparisonGain | None:
-        """The analytical gain on a scenario, or None where it is measured only."""
+        """The analytical gain on a scenario, or None if none can be derived."""
         return None if self.cancel_drift else consensus_gain(scenario, self.gain, bounded=False)

@@ -13,13 +13,13 @@ from khop_env.simulation import View
 
 @dataclass
 class FormationLaw(VelocityLaw):
-    """v_i = k times the mean over task edges of (p_j - p_i - d_ij), shortened to `speed` with its direction kept.
+    """v_i = k times the mean over task edges of (p_j - p_i - d_ij), its norm limited to `speed`.
 
     Displacement-based formation control (K.-K. Oh, M.-C. Park and H.-S. Ahn, Automatica 53, 2015, section 4). Goal set
-    A: p_j - p_i = d_ij on all task edges, wherever the formation stands. With z_i = p_i - r_i, d_ij = r_j - r_i and n_i
+    A: p_j - p_i = d_ij on all task edges, wherever the formation is. With z_i = p_i - r_i, d_ij = r_j - r_i and n_i
     edges, single integrators without drift move by z' = -k N^-1 L z: V = sum n_i |z_i - z_bar|^2 / 2 about the
     n-weighted mean decreases at k z' L z, and errors enter linearly, so that the loop is set-ISS with respect to A with
-    a linear gain while no speed is cut off (for a connected task graph). With speeds cut off, a drift that isn't
+    a linear gain while no speed is limited (for a connected task graph). With limited speeds, a drift that isn't
     cancelled, or other models: measured only.
 
     Attributes:
@@ -37,7 +37,7 @@ class FormationLaw(VelocityLaw):
         self.require_positive("gain", "speed")
 
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
-        """The mean displacement, shortened."""
+        """The gain times the mean displacement, its norm limited to `speed`."""
         sum_edges(self.gain, False, view.edges, displacement, velocity)
         velocity /= np.maximum(view.known_edges(), 1)[:, None]
         length = np.sqrt((velocity * velocity).sum(axis=1, keepdims=True))

@@ -1,4 +1,4 @@
-"""Feedback laws by name: scenarios name theirs by a string, and nothing below this package knows what it means."""
+"""Feedback laws by name: scenarios refer to a law by a string, which is resolved here."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ LAWS: dict[str, Callable[..., Law]] = {
 
 
 class LawError(ValueError):
-    """A law that there isn't, or that can't be made with these parameters.
+    """The law is unknown, or a parameter is unknown or invalid.
 
     Attributes:
-        parameter: The parameter that is wrong; None where it isn't one alone.
+        parameter: name of the invalid parameter; None if the error isn't due to a single one.
     """
 
     def __init__(self, message: str, parameter: str | None = None) -> None:
@@ -36,10 +36,10 @@ class LawError(ValueError):
 
 
 def make_law(choice: LawChoice | str) -> Law:
-    """The law of a scenario, e.g. `make_law(scenario.law)`, or one by name: "tanh", "linear:gain=2,cancel_drift=true".
+    """A scenario's law, e.g. `make_law(scenario.law)`, or a law by name: "tanh", "linear:gain=2,cancel_drift=true".
 
     Raises:
-        LawError: for an unknown name or parameter, or a parameter of the wrong type or value.
+        LawError: if the name or a parameter is unknown, or a parameter has the wrong type or value.
     """
     name, _, text = choice.partition(":") if isinstance(choice, str) else (choice.name, "", "")
     if name not in LAWS:
@@ -61,7 +61,7 @@ def make_law(choice: LawChoice | str) -> Law:
             raise LawError(f"{name} of law {choice.name!r} must be {describe(expected)}; got {value!r}", name)
         if expected is float:
             try:
-                parameters[name] = float(value)  # compiled loops take no integer of any size
+                parameters[name] = float(value)  # compiled loops take no integers of arbitrary size
             except OverflowError:
                 raise LawError(f"{name} of law {choice.name!r} is too large for a number", name) from None
     try:
@@ -72,6 +72,6 @@ def make_law(choice: LawChoice | str) -> Law:
 
 def _known(name: str, known: list[str]) -> str:
     if not known:
-        return "it takes none"
+        return "it has no parameters"
     near = did_you_mean(name, known)
     return f"{near} (known: {', '.join(known)})" if near.startswith("did") else near

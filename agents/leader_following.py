@@ -1,4 +1,4 @@
-"""Tracking a leader whose input nobody knows."""
+"""Leader following with an unknown leader input."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from khop_env.simulation import View
 
 @dataclass
 class LeaderFollowingLaw(VelocityLaw):
-    """v_i = k (s q_i - p_i), with q_i the mean over task edges of where the leader wants the agent, p_j - d_ij.
+    """v_i = k (s q_i - p_i), with q_i the mean over task edges of the wanted position p_j - d_ij.
 
-    A proportional tracker whose target is shrunk towards the origin by s: followers whose inputs saturate can't catch
-    up with a leader that swings about, and are nearer to it on average if they aim at less. Goal set A: q_i = p_i. With
-    s = 1 and the drift cancelled z_i = p_i - q_i of a single integrator obeys z' = -k z + k d + w - q', so that
-    |z| <= e^(-k t) |z(0)| + |d| + (|w| + |q'|) / k while its input isn't cut off: set-ISS with respect to A with
-    gamma(s) = s for estimation errors d, and with the leader's speed |q'| as one more input that keeps it away from A.
-    With s < 1, saturation, or other models: measured only.
+    A proportional tracker whose reference is scaled towards the origin by s: followers whose inputs saturate can't
+    catch up with a quickly oscillating leader, and are nearer to it on average with a smaller reference. Goal set A:
+    q_i = p_i. With s = 1 and the drift cancelled z_i = p_i - q_i of a single integrator obeys
+    z' = -k z + k d + w - q', so that |z| <= e^(-k t) |z(0)| + |d| + (|w| + |q'|) / k while its input doesn't saturate:
+    set-ISS with respect to A with gamma(s) = s for estimation errors d, and with the leader's speed |q'| as a further
+    disturbance input. With s < 1, saturation, or other models: measured only.
 
-    An agent that knows nothing of its leader keeps near the origin, where the library's initial sets are centred: prior
-    knowledge, which in consensus is enough to meet without hearing anybody.
+    An agent without information on its leader stays near the origin, where the library's initial sets are centred. In
+    consensus this prior knowledge is enough to meet without any communication.
 
     Attributes:
         gain: k in 1/s, positive and finite.
@@ -42,7 +42,7 @@ class LeaderFollowingLaw(VelocityLaw):
             raise ValueError(f"shrink must be from 0 to 1; got {self.shrink!r}")
 
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
-        """Towards the shrunk target."""
+        """The gain times the distance to the scaled reference."""
         agents = len(velocity)
         edges = np.bincount(view.edges[:, 0], minlength=agents)[:, None, None]
         known = view.known_edges()[:, None]

@@ -16,29 +16,29 @@ from khop_env.scenarios import Scenario
 
 @dataclass(frozen=True)
 class ComparisonGain:
-    """What V = |e|^2 / 2 says of x_i' = f(x_i) + k sum_j phi(p_j + d_ij - p_i) + w_i, along a connected task graph.
+    """Comparison equation of V = |e|^2 / 2 for x_i' = f(x_i) + k sum_j phi(p_j + d_ij - p_i) + w_i, connected graph.
 
-    d collects the estimation errors along those directed task edges (i, j) whose i doesn't hear j, and phi is the
+    d collects the estimation errors along the directed task edges (i, j) whose j isn't a neighbour of i, and phi is the
     identity or tanh, component by component. Pi annihilates f at the mean, so that e' Pi f <= l |e|^2 for a common f
     with Lipschitz constant l. Without errors the coupling contributes -k sum over edges of s phi(s) with
     s = p_j - p_i; all |s| <= sqrt(2) |e|, where s tanh(s) >= s^2 tanh(r) / r for |s| <= r; and the sum of the s^2 is
     e' L e >= lambda_2 |e|^2. Both phi are 1-Lipschitz, so that by Cauchy and Schwarz the errors add at most
-    k sqrt(D) |d| |e|, if no agent has more than D such edges. Therefore
+    k sqrt(D) |d| |e|, where D is the largest number of such edges of an agent. Therefore
 
         |e|' <= -h(|e|) + k sqrt(D) |d| + |Pi w|,   h(b) = k lambda_2 tanh(sqrt(2) b) / sqrt(2) - l b    (tanh)
                                                     h(b) = (k lambda_2 - l) b                          (linear)
 
     and where h increases, up to `region`, the loop is set-ISS with respect to A = {e = 0}, with the gain
-    gamma(s) = h^-1(k sqrt(D) s). It is the argument that the paper's simulation section sketches, with its V, made
+    gamma(s) = h^-1(k sqrt(D) s). This makes the argument sketched in the paper's simulation section, with the same V,
     quantitative. It holds as long as no input saturates: always for tanh commands below the limits, and for linear ones
-    while k (sqrt(2) n |e| + sqrt(D) |d|) is below them, with at most n edges per agent.
+    while k (sqrt(2) n |e| + sqrt(D) |d|) is below them, where n is the largest degree.
 
     Attributes:
         coupling: k lambda_2 in 1/s.
         lipschitz: l in 1/s.
         error_weight: k sqrt(D) in 1/s.
-        bounded: whether phi is tanh.
-        most_pull: sqrt(2) k n in 1/s: the largest commanded speed over |e|.
+        bounded: whether phi is tanh, not the identity.
+        most_pull: sqrt(2) k n in 1/s: bound on the commanded speed divided by |e|.
         limit: the smallest input limit in m/s.
     """
 
@@ -68,36 +68,36 @@ class ComparisonGain:
     def step(
         self, distance: FloatArray, error: FloatArray, dt: float, disturbance: FloatArray | float = 0.0
     ) -> FloatArray:
-        """Where the comparison equation b' = -h(b) + k sqrt(D) |d| + |Pi w| goes in `dt` seconds.
+        """Integrate the comparison equation b' = -h(b) + k sqrt(D) |d| + |Pi w| over `dt` seconds (classical RK4).
 
         Args:
-            distance: bounds on |e| now, in m.
-            error: |d| during the step, in m.
+            distance: (B,) bounds on |e| at the beginning of the step, in m.
+            error: (B,) |d| during the step, in m.
             dt: in s.
-            disturbance: |Pi w| during the step, in m/s.
+            disturbance: (B,) or scalar |Pi w| during the step, in m/s.
 
         Returns:
-            In m; inf once it has left the region.
+            (B,) bounds on |e| at the end of the step, in m; inf once the region has been left.
         """
         gone, distance = np.isinf(distance), np.where(np.isinf(distance), 0.0, distance)
         pushed = self.error_weight * error + disturbance
-        one = pushed - self.decrease(distance)  # the classical Runge-Kutta step
-        two = pushed - self.decrease(distance + 0.5 * dt * one)
-        three = pushed - self.decrease(distance + 0.5 * dt * two)
-        four = pushed - self.decrease(distance + dt * three)
-        after = distance + dt / 6.0 * (one + 2.0 * two + 2.0 * three + four)
-        largest = np.array([self.region(float(one)) for one in error.flat]).reshape(error.shape)
+        k1 = pushed - self.decrease(distance)
+        k2 = pushed - self.decrease(distance + 0.5 * dt * k1)
+        k3 = pushed - self.decrease(distance + 0.5 * dt * k2)
+        k4 = pushed - self.decrease(distance + dt * k3)
+        after = distance + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        largest = np.array([self.region(float(norm)) for norm in error.flat]).reshape(error.shape)
         return np.where(~gone & (np.maximum(distance, after) <= largest), after, math.inf)
 
     def ultimate(self, error: float, disturbance: float = 0.0) -> float:
-        """h^-1(k sqrt(D) |d| + |Pi w|): the distance below which |e| ends, in m.
+        """Ultimate bound on |e|, h^-1(k sqrt(D) |d| + |Pi w|), in m.
 
         Args:
             error: bound on |d| in m.
             disturbance: bound on |Pi w| in m/s.
 
         Returns:
-            inf where they are too large for the argument, or the drift too strong.
+            inf if error, disturbance or drift are too large for a bound to exist.
         """
         pushed, low, high = self.error_weight * error + disturbance, 0.0, self.region(error)
         if high <= 0.0:
@@ -118,20 +118,20 @@ class ComparisonGain:
         return high
 
 
-_COMMON_DRIFT = (SingleIntegrator, DriftingIntegrator)  # none of their parameters changes the drift
+_COMMON_DRIFT = (SingleIntegrator, DriftingIntegrator)  # their drift has no parameters
 
 
 def consensus_gain(scenario: Scenario, gain: float, *, bounded: bool) -> ComparisonGain | None:
-    """The comparison of a consensus law on a scenario, where one can be derived.
+    """The comparison equation of a consensus law on a scenario, if it can be derived.
 
     Args:
-        scenario: fleet and graphs.
+        scenario: provides the fleet and the graphs.
         gain: k of the law, in 1/s.
-        bounded: whether it acts on the tanh of displacements.
+        bounded: whether the law takes tanh of the displacements.
 
     Returns:
-        None unless all agents are single or all drifting integrators, which have one f and move by x' = f(x) + u, and
-        the task graph connects them; or if tanh commands could exceed an input limit.
+        None unless all agents are single integrators or all are drifting integrators (x' = f(x) + u with a common f)
+        and the task graph is connected; None also if tanh commands could exceed an input limit.
     """
     fleet, task, models = scenario.fleet, scenario.task, scenario.fleet.models
     if type(models[0]) not in _COMMON_DRIFT or any(type(model) is not type(models[0]) for model in models):
@@ -143,11 +143,11 @@ def consensus_gain(scenario: Scenario, gain: float, *, bounded: bool) -> Compari
         return None
     adjacency = nx.to_numpy_array(task)  # networkx's own Laplacian needs SciPy
     connectivity = float(np.linalg.eigvalsh(np.diag(adjacency.sum(axis=0)) - adjacency)[1])
-    unheard = max(sum(not scenario.communication.has_edge(i, j) for j in task[i]) for i in range(len(fleet)))
+    estimated = max(sum(not scenario.communication.has_edge(i, j) for j in task[i]) for i in range(len(fleet)))
     return ComparisonGain(
         coupling=gain * connectivity,
         lipschitz=models[0].drift_lipschitz(),
-        error_weight=gain * math.sqrt(unheard),
+        error_weight=gain * math.sqrt(estimated),
         bounded=bounded,
         most_pull=math.sqrt(2.0) * gain * degree,
         limit=limit,

@@ -1,4 +1,4 @@
-"""Policies by name: what the command line and the examples ask for."""
+"""Policies by name, for the command line and the examples."""
 
 from __future__ import annotations
 
@@ -19,58 +19,60 @@ FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy]] = {
     "bang_bang": BangBangPolicy,
 }
 POLICIES = (*LAWS, *FLOOR)
-"""Names of the policies without a file of their own."""
+"""Names of the scripted policies."""
 
 
 def make_policy(spec: str) -> Policy:
     """A policy by name, with parameters after a colon.
 
-        make_policy("tanh")                  # tuned where there are tuned parameters, otherwise the defaults
+        make_policy("tanh")                  # shipped tuned parameters if there are any, else the defaults
         make_policy("linear:gain=2,cancel_drift=true")
         make_policy("zero")
-        make_policy("ppo:runs/mine")         # what khop train learned: its folder, or one of the .npz files in it
-        make_policy("ppo:pretrained")        # shipped with the library, for some environments and scenarios
-        make_policy("ppo:pretrained/consensus_v0")  # the one for this environment
-        make_policy("my_file.py:MyPolicy")   # a class of your own, or an object; "my_module:MyPolicy" likewise
+        make_policy("ppo:runs/first")        # written by khop train: its folder, or one of the .npz files in it
+        make_policy("ppo:pretrained")        # shipped with the library for some environments and scenarios
+        make_policy("ppo:pretrained/consensus_v0")  # the shipped policy for this environment
+        make_policy("my_file.py:MyPolicy")   # your own class or object; also "my_module:MyPolicy"
 
     Raises:
-        ValueError: for an unknown name or parameter, naming the nearest, a wrong value, or a file that isn't a policy.
+        ValueError: if a name or parameter is unknown (the message suggests the closest match), a value is invalid, or a
+            file isn't a policy.
     """
-    name, _, given = spec.partition(":")
+    name, _, argument = spec.partition(":")
     if name not in (*POLICIES, *ALGORITHMS) and is_object_name(spec):
-        return _policy_of_your_own(spec)
+        return _user_policy(spec)
     if name in ALGORITHMS:
-        if not given:
-            raise ValueError(f"policy {spec!r}: say which, {name}:FOLDER or {name}:pretrained")
-        if given == "pretrained" or given.startswith("pretrained/"):
+        if not argument:
+            raise ValueError(f"policy {spec!r}: no policy file named; expected {name}:FOLDER or {name}:pretrained")
+        if argument == "pretrained" or argument.startswith("pretrained/"):
             if name != "ppo":
-                raise ValueError(f"policy {spec!r}: the shipped policies are ppo:pretrained")
-            environment = given.partition("/")[2] or None
+                raise ValueError(f"policy {spec!r}: only ppo:pretrained is shipped")
+            environment = argument.partition("/")[2] or None
             if environment not in (None, *environments()):
                 raise ValueError(
                     f"policy {spec!r}: no environment {environment!r}; {did_you_mean(environment, environments())}"
                 )
             return PretrainedPolicy(environment)
-        policy = LearnedPolicy.load(given)
+        policy = LearnedPolicy.load(argument)
         if policy.about["algorithm"] != name:
-            raise ValueError(f"policy {spec!r}: {given} was trained by {policy.about['algorithm']}")
+            raise ValueError(f"policy {spec!r}: {argument} was trained by {policy.about['algorithm']}")
         return policy
     if name in LAWS:
-        parameters = parameters_from_text(given, get_type_hints(LAWS[name]), f"policy {spec!r}")
+        parameters = parameters_from_text(argument, get_type_hints(LAWS[name]), f"policy {spec!r}")
         return LawPolicy(name, parameters)
     if name not in POLICIES:
         raise ValueError(f"no policy {name!r}; {did_you_mean(name, (*POLICIES, *ALGORITHMS))}")
-    if given:
+    if argument:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
     return FLOOR[name]()
 
 
-def _policy_of_your_own(spec: str) -> Policy:
-    found = load_object(spec)
-    policy = called(spec, found) if isinstance(found, type) else found
+def _user_policy(spec: str) -> Policy:
+    loaded = load_object(spec)
+    policy = called(spec, loaded) if isinstance(loaded, type) else loaded
     if not (callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None))):
         raise ValueError(
-            f"policy {spec!r}: a policy has reset(env, seeds) and act(observations); got {type(policy).__name__}"
+            f"policy {spec!r}: expected an object with reset(env, seeds) and act(observations); got "
+            f"{type(policy).__name__}"
         )
     checked: Policy = policy
     return checked

@@ -1,4 +1,4 @@
-"""What a policy is, and what it is told of the environment beside its observations."""
+"""The policy interface, and the description of an environment that a policy gets before its observations."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ from typing import Protocol
 
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.env import BatchedEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
 from khop_env.physics import AgentModel
 from khop_env.simulation import Observe
 
 Observations = Mapping[str, Float32Array]
-"""Per agent (..., D_i): one observation, or one per environment of a batch."""
+"""(..., D_i) by agent: a single observation, or a batch with one row per environment."""
 
 
 @dataclass(frozen=True, eq=False)
 class EnvDescription:
-    """The environment as its designer knows it beforehand: names, models, layouts, and no state.
+    """Static description of an environment: names, models and layouts, but no state.
 
     Attributes:
         environment: e.g. "consensus_v0".
         scenario: name of the scenario.
-        observe: what the slots of agents beyond the neighbours hold.
+        observe: what the slots of k-hop targets hold: estimates, true states, or nothing.
         control_period: time between actions in s.
-        models: the model of each agent that acts, by id, in the environment's order.
-        layouts: what each agent's observation holds.
-        action_sizes: entries of each agent's action, padding included.
+        models: model of each acting agent, by id, in the environment's order.
+        layouts: layout of each agent's observation, by id.
+        action_sizes: number of entries of each agent's action, padding included, by id.
         error_unit: unit of the task error.
     """
 
@@ -41,30 +42,32 @@ class EnvDescription:
     action_sizes: Mapping[str, int]
     error_unit: str = "m"
 
+    __repr__ = brief
+
     @property
     def agents(self) -> tuple[str, ...]:
-        """Ids of the agents that act."""
+        """Ids of the acting agents."""
         return tuple(self.models)
 
 
 class Policy(Protocol):
-    """A decision maker: all it sees are observations."""
+    """Maps observations to actions; it has access to nothing else."""
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Get ready for new episodes.
+        """Prepare for new episodes.
 
         Args:
-            env: what is known beforehand.
-            seeds: one per environment of the batch, for policies that draw random numbers; not the environments' own
-                (`policy_seeds`).
+            env: static description of the environment.
+            seeds: one per environment of the batch, for policies that draw random numbers; they differ from the
+                environments' own seeds (`policy_seeds`).
 
         Raises:
-            ValueError: for an environment that the policy can't act in, saying what doesn't fit.
+            ValueError: if the policy doesn't fit the environment; the message says why.
         """
         ...
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """Actions.
+        """Choose actions.
 
         Args:
             observations: (..., D_i) by agent.
@@ -76,7 +79,7 @@ class Policy(Protocol):
 
 
 def describe(env: object) -> EnvDescription:
-    """What a policy is told of an environment, of any kind that `batched_of` knows."""
+    """The static description of an environment of any kind that `batched_of` accepts."""
     batched = batched_of(env)
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
     return EnvDescription(
@@ -92,22 +95,22 @@ def describe(env: object) -> EnvDescription:
 
 
 def policy_seeds(seeds: Sequence[int]) -> list[int]:
-    """Seeds for a policy's own random numbers in episodes with these seeds, from which it can't tell them."""
+    """Seeds for a policy's own random numbers, from which the episodes' seeds can't be inferred."""
     return [int(np.random.SeedSequence([int(seed), 1]).generate_state(1, np.uint64)[0]) for seed in seeds]
 
 
 def batched_of(env: object) -> BatchedEnv:
-    """The arrays behind an environment of any kind, wrapped or not; wrappers have no part in what is done with them.
+    """The `BatchedEnv` inside an environment of any kind of this library; wrappers are bypassed.
 
     Raises:
-        TypeError: for something else.
+        TypeError: if `env` isn't an environment of khop_env.
     """
     found = env
-    for _ in range(100):  # wrappers around each other
+    for _ in range(100):  # nested wrappers
         if isinstance(found, BatchedEnv):
             return found
         inner = (getattr(found, name, None) for name in ("batched", "unwrapped", "venv", "env", "par_env"))
-        found = next((one for one in inner if one is not None and one is not found), None)
+        found = next((layer for layer in inner if layer is not None and layer is not found), None)
         if found is None:
             break
     raise TypeError(

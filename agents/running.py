@@ -1,4 +1,4 @@
-"""A policy in its environment, stepped and recorded as a simulator is."""
+"""A policy in its environment, with the interface of a simulator, for recordings."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from khop_env.simulation import Observe, Simulator
 
 
 class PolicyRun:
-    """Stands in for a simulator in `results.record`: its steps are control periods of an environment with a policy.
+    """A policy in closed loop with its environment, to be passed to `results.record`; a step is a control period.
 
     Args:
         env: the environment; it is reset.
-        policy: chooses the actions.
-        seed: of the episode.
-        name: of the policy, for errors.
+        policy: the policy.
+        seed: seed of the episode.
+        name: name of the policy, for errors.
 
     Attributes:
-        episode_return: mean over the agents of the rewards so far.
+        episode_return: mean over the agents of the sum of their rewards so far.
     """
 
     def __init__(self, env: KHopEnv, policy: Policy, seed: int, name: str = "policy") -> None:
@@ -51,17 +51,17 @@ class PolicyRun:
 
     @property
     def duration(self) -> float:
-        """Of the episode, in s."""
+        """Length of the episode in s."""
         settings = self.env.batched.settings
         return settings.max_cycles * settings.control_period
 
     @property
     def extremes(self) -> Extremes:
-        """The largest ratios since the reset, not only since the last action."""
+        """The largest ratios since the reset, over all actions."""
         return self._extremes.copied()
 
     def task_error(self) -> float:
-        """Mean over the agents of their task error now."""
+        """Current task error, mean over the agents."""
         return float(self.env.batched.task_errors().mean())
 
     def ended(self) -> bool:
@@ -69,7 +69,7 @@ class PolicyRun:
         return not self.env.agents
 
     def step(self, dt: float) -> None:
-        """One control period, whose length `dt` has to be.
+        """Advance by one control period; `dt` must be its length.
 
         Raises:
             StoppedError: if the policy fails, or its actions are refused.
@@ -107,16 +107,17 @@ def policy_run(
     A learned policy gets the bounds and arguments that it was trained with, unless `arguments` have others.
 
     Args:
-        spec: what `make_policy` takes, e.g. "zero", "tanh" or "ppo:runs/mine".
-        scenario: where it acts.
+        spec: what `make_policy` takes, e.g. "zero", "tanh" or "ppo:runs/first".
+        scenario: scenario of the environment.
         observe: observation mode.
-        duration: of the episode in s, rounded up to whole control periods; None for that of the environment.
-        seed: of the episode.
-        environment: name or task; `environment_for` chooses by default.
-        arguments: of the environment.
+        duration: length of the episode in s, rounded up to whole control periods; None for the environment's.
+        seed: seed of the episode.
+        environment: name or task; by default `environment_for` chooses.
+        arguments: arguments of the environment.
 
     Raises:
-        ValueError: for a policy that doesn't fit, an environment that isn't known, or both a duration and max_cycles.
+        ValueError: if the policy doesn't fit the environment, an argument is wrong, or there are both a duration and
+            max_cycles.
     """
     policy, chosen = make_policy(spec), dict(arguments or {})
     environment = environment_for(spec, scenario) if environment is None else environment

@@ -1,4 +1,4 @@
-"""Scripted policies: the feedback laws on observations, two that everything has to beat, and an adversary."""
+"""Scripted policies: feedback laws on observations, two baselines, and an adversary of the observers."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from khop_env.simulation import View
 
 
 class ZeroPolicy:
-    """Does nothing."""
+    """All inputs zero: a baseline."""
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Remember the actions' sizes."""
+        """Store the action sizes."""
         self._sizes = env.action_sizes
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """Zeros."""
+        """Zero actions."""
         return {
-            agent: np.zeros((*given.shape[:-1], self._sizes[agent]), np.float32)
-            for agent, given in observations.items()
+            agent: np.zeros((*observation.shape[:-1], self._sizes[agent]), np.float32)
+            for agent, observation in observations.items()
         }
 
 
 class RandomPolicy:
-    """Uniform in [-1, 1], from a generator for each environment of the batch."""
+    """Uniform in [-1, 1], with one generator per environment of the batch: a baseline."""
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Seed the generators."""
@@ -42,16 +42,17 @@ class RandomPolicy:
         self._generators = [np.random.default_rng(int(seed)) for seed in seeds]
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """New numbers for every environment."""
+        """New random actions for every environment."""
         batch = next(iter(observations.values())).shape[:-1]
         width = sum(self._sizes[agent] for agent in observations)
-        drawn = np.array([one.uniform(-1.0, 1.0, width) for one in self._generators], np.float32).reshape(*batch, width)
+        rows = [generator.uniform(-1.0, 1.0, width) for generator in self._generators]
+        drawn = np.array(rows, np.float32).reshape(*batch, width)
         ends = np.cumsum([self._sizes[agent] for agent in observations])[:-1]
         return dict(zip(observations, np.split(drawn, ends, axis=-1), strict=True))
 
 
 class BangBangPolicy(RandomPolicy):
-    """Full inputs of random sign, the same for all agents or not by turns of two seconds: an adversary of observers."""
+    """Full inputs of random sign, alternating every two seconds between a common and individual signs: an adversary."""
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Seed the generators."""
@@ -59,7 +60,7 @@ class BangBangPolicy(RandomPolicy):
         self._cycle, self._turn = 0, max(1, round(2.0 / env.control_period))
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """Signs."""
+        """Actions of -1 or 1."""
         drawn = super().act(observations)
         if self._cycle // self._turn % 2 == 0:
             first = next(iter(drawn.values()))[..., :1]
@@ -69,24 +70,24 @@ class BangBangPolicy(RandomPolicy):
 
 
 class LawPolicy:
-    """A feedback law that reads its quantities by name from observations, and acts once in a control period.
+    """A feedback law on observations, evaluated once per control period.
 
-    The law is the same object that a simulator evaluates in continuous time; what it is shown is built from each
-    agent's own observation: its own state, and the slots that its task has an edge to.
+    The law is the same object that a simulator evaluates in continuous time. Its `View` is built from each agent's own
+    observation: the agent's own state, and the slots of the agents that it shares a task edge with.
 
     Args:
-        name: of the law.
-        parameters: its parameters; those left out are the tuned ones for environment, scenario and observation mode
-            where there are any (`agents/tuned.toml`), otherwise the law's defaults. A gain that is left out is lowered
-            for control periods that are too long for it (`agents.tuned.sampled_gain`); `law.gain` is what is used.
+        name: name of the law.
+        parameters: parameters of the law; others are the tuned ones for environment, scenario and observation mode if
+            there are any (`agents/tuned.toml`), else the law's defaults. A gain that isn't passed is lowered if the
+            control period is too long for it (`agents.tuned.sampled_gain`); `law.gain` is the gain in use.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, Any] | None = None) -> None:
         self.name, self.parameters = name, dict(parameters or {})
-        make_law(LawChoice(name, self.parameters))  # refuses what there isn't
+        make_law(LawChoice(name, self.parameters))  # raises on unknown names or parameters
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Choose the parameters, and look up where in the observations everything is."""
+        """Choose the parameters, and look up the columns of the observations by name."""
         tuned = tuned_parameters(env, self.name)
         self.law = make_law(LawChoice(self.name, {**tuned, **self.parameters}))
         if isinstance(self.law, VelocityLaw) and hasattr(self.law, "gain") and "gain" not in self.parameters:
@@ -109,15 +110,15 @@ class LawPolicy:
         fractions = (inputs / self._fleet.input_limit).astype(np.float32)
         actions = {}
         for number, (agent, size) in enumerate(self._env.action_sizes.items()):
-            mine = fractions[:, self._fleet.input_slice(number)]
+            own = fractions[:, self._fleet.input_slice(number)]
             actions[agent] = np.zeros((len(flat), size), np.float32)
-            actions[agent][:, : mine.shape[1]] = mine
+            actions[agent][:, : own.shape[1]] = own
             actions[agent] = actions[agent].reshape(*shape, size)
         return actions
 
 
 class _Reader:
-    """Where the observations, side by side, hold what a `View` shows."""
+    """Builds a `View` from the concatenated observations of all agents."""
 
     def __init__(self, env: EnvDescription, fleet: Fleet) -> None:
         self._fleet, dim = fleet, fleet.position_dim
@@ -148,7 +149,7 @@ class _Reader:
         self._wanted = np.array(wanted, np.int64).reshape(-1, dim)
 
     def view(self, flat: Float32Array, old: View | None) -> View:
-        """What observations (B, columns) show; in the memory of `old` where that fits."""
+        """The view from observations (B, columns); the memory of `old` is reused if its batch has the same size."""
         batch = len(flat)
         if old is None or len(old.x) != batch:
             columns = np.zeros((len(self._edges), self._fleet.position_dim, batch))

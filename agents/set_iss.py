@@ -1,10 +1,10 @@
-"""Theorem 4 measured: how far estimation errors keep the team from its goal set.
+"""Measurement of Theorem 4: the distance at which estimation errors keep the team from its goal set.
 
 Two experiments on a scenario's closed loop, whose goal set A is agreement of the positions:
 
-- `injected_errors`: the controller sees the truth plus errors of a given size; its ultimate distance to A over that
-  size is the empirical set-ISS gain, beside the analytical one (`ComparisonGain`).
-- `swept_bounds`: the controller sees the observers' estimates, and the bounds' final value delta(inf) is swept.
+- `injected_errors`: the law acts on true states plus errors of a prescribed norm; the ultimate distance to A divided by
+  that norm is the empirical set-ISS gain, listed beside the analytical one (`ComparisonGain`).
+- `swept_bounds`: the law acts on the observers' estimates, and the bounds' final value delta(inf) is swept.
 """
 
 from __future__ import annotations
@@ -30,61 +30,61 @@ from khop_env.tasks import directed
 SIZES = tuple(float(f"{size:.3g}") for size in np.geomspace(0.02, 2.0, 7))  # m
 FACTORS = tuple(float(f"{factor:.3g}") for factor in np.geomspace(10.0, 0.1, 7))  # of the scenario's delta(inf)
 PATTERNS = ("constant", "swinging", "adversarial")
-TAIL = 0.25  # of a run, in which ultimate values are taken
-BEGIN = 0.3  # of a run with observers: their transient is over, and the paired oracle run begins
+TAIL = 0.25  # last fraction of a run, in which ultimate values are taken
+BEGIN = 0.3  # fraction of a run after which the observers' transient is over and the paired oracle run begins
 
 _ROUNDING = 1e-4  # relative: errors of the simulator's and of the comparison's steps
 
 
 def analytical_gain(scenario: Scenario) -> ComparisonGain | None:
-    """The gain of the scenario's law where one can be derived; None where it can only be measured."""
+    """The set-ISS gain of the scenario's law; None if it can only be measured."""
     derive = getattr(make_law(scenario.law), "set_iss_gain", None)
     return None if derive is None else derive(scenario)
 
 
-class Misinformed:
-    """A law that sees errors of a given size on what its agents can't hear.
+class PerturbedLaw:
+    """A law with errors of prescribed norm on the positions of agents that aren't neighbours.
 
-    Constant errors have random directions; swinging ones rotate between two; adversarial ones push every agent away
-    from the mean, which the Lyapunov function likes least. The stacked error of an environment always has the norm
+    Constant errors have random directions; swinging ones rotate between two; adversarial ones drive every agent away
+    from the mean, which increases the Lyapunov function most. The stacked error of an environment always has the norm
     `size`.
 
     Args:
-        law: the law.
+        law: the unperturbed law.
         size: norm of the stacked error, in m.
-        unheard: (E,) the task edges that carry errors.
+        perturbed: (E,) task edges that carry errors.
         rng: draws directions and frequencies.
-        batch: environments; the patterns take turns.
-        dim: of a position.
+        batch: number of environments; the patterns alternate.
+        dim: dimension of a position.
     """
 
     def __init__(
-        self, law: Law, size: float, unheard: NDArray[np.bool_], rng: np.random.Generator, batch: int, dim: int
+        self, law: Law, size: float, perturbed: NDArray[np.bool_], rng: np.random.Generator, batch: int, dim: int
     ) -> None:
-        self.size, self._law, self._unheard = size, law, unheard
-        shape = 2, batch, int(unheard.sum()), dim
+        self.size, self._law, self._perturbed = size, law, perturbed
+        shape = 2, batch, int(perturbed.sum()), dim
         self._directions = rng.normal(size=shape)
         self._frequency = rng.uniform(0.2, 5.0, batch)  # rad/s
         self._pattern = np.arange(batch) % len(PATTERNS)
         self._seen: View | None = None
 
     def errors(self, t: FloatArray, view: View) -> FloatArray:
-        """(B, unheard edges, d) errors in m."""
-        one, other = self._directions
+        """(B, perturbed edges, d) errors in m."""
+        first, second = self._directions
         angle = np.where(self._pattern == 1, self._frequency * t, 0.0)[:, None, None]
-        errors = np.cos(angle) * one + np.sin(angle) * other
+        errors = np.cos(angle) * first + np.sin(angle) * second
         positions = view.fleet.positions(view.x)
-        away = (positions - positions.mean(axis=1, keepdims=True))[:, view.edges[self._unheard, 0]]
+        away = (positions - positions.mean(axis=1, keepdims=True))[:, view.edges[self._perturbed, 0]]
         errors = np.where((self._pattern == 2)[:, None, None], away, errors)
         length = np.sqrt((errors**2).sum(axis=(1, 2), keepdims=True))
         return np.asarray(self.size * errors / np.maximum(length, 1e-12))
 
     def __call__(self, t: FloatArray, view: View) -> FloatArray:
-        """The law's inputs on the truth plus errors."""
+        """Inputs (B, m) of the law on true states plus errors."""
         if self._seen is None:
-            self._seen = dataclasses.replace(view)  # one object for all calls, as laws expect it
+            self._seen = dataclasses.replace(view)  # the same object in all calls, as laws expect
         self._seen.x, self._seen.displacement = view.x, view.displacement.copy(order="K")
-        self._seen.displacement[:, self._unheard] += self.errors(t, view)
+        self._seen.displacement[:, self._perturbed] += self.errors(t, view)
         return self._law(t, self._seen)
 
 
@@ -96,34 +96,34 @@ def injected_errors(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """The ultimate distance to A of the law on the truth plus errors, without disturbances.
+    """The ultimate distance to A of the law on true states plus errors, without disturbances.
 
     Args:
-        scenario: fleet, graphs, law.
+        scenario: provides fleet, graphs and law.
         sizes: norms of the stacked error in m.
-        episodes: initial states, for each pattern of errors.
-        seed: of the initial states and the errors.
-        progress: told how far it is.
+        episodes: number of initial states for each pattern of errors.
+        seed: seed of the initial states and the errors.
+        progress: called with the completed fraction.
 
     Returns:
-        A row per size and pattern: error, pattern, distance (the largest in the last quarter of a run, over the
-        episodes), gain (distance over error), bound (what the analytical gain allows in the limit; None where there is
-        none), all in m; and holds (whether every run kept to the comparison equation from where its last quarter began;
-        None where that says nothing).
+        One row per size and pattern: `error` and `pattern`; `distance`, the largest in the last quarter of a run over
+        the episodes; `gain`, distance over error; `bound`, the ultimate bound by the analytical gain or None; and
+        `holds`, whether every run stayed below the solution of the comparison equation through the last quarter, or
+        None if there is none. Lengths are in m.
 
     Raises:
-        Interrupted: a KeyboardInterrupt that holds the rows until then.
+        Interrupted: on Ctrl-C; its `partial` holds the rows until then.
     """
     calm, bound, batch = scenario.replace(disturbance=None), analytical_gain(scenario), episodes * len(PATTERNS)
     edges = directed(calm.task)
-    unheard = np.array([not calm.communication.has_edge(i, j) for i, j in edges.tolist()], bool)
+    perturbed = np.array([not calm.communication.has_edge(i, j) for i, j in edges.tolist()], bool)
     x0 = [calm.initial.draw(np.random.default_rng(seed + b // len(PATTERNS))) for b in range(batch)]
     steps = round(calm.duration / calm.dt)
     rows: list[dict[str, Any]] = []
 
     def inject(number: int, size: float) -> Iterator[dict[str, Any]]:
         rng = np.random.default_rng([seed, 2])  # the same directions for every size
-        law = Misinformed(make_law(calm.law), size, unheard, rng, batch, calm.fleet.position_dim)
+        law = PerturbedLaw(make_law(calm.law), size, perturbed, rng, batch, calm.fleet.position_dim)
         simulator = calm.build(law=law, observe="oracle", num_envs=batch)
         simulator.reset(seed, x0)
         distance, kept = np.zeros(batch), np.ones(batch, bool)
@@ -142,9 +142,9 @@ def injected_errors(
                 progress((number + step / steps) / len(sizes))
         analytical = None if bound is None else finite(bound.ultimate(size))
         for kind, pattern in enumerate(PATTERNS):
-            mine = slice(kind, None, len(PATTERNS))
-            worst = float(distance[mine].max())
-            holds = bool(kept[mine].all()) if np.isfinite(limit[mine]).all() else None
+            selected = slice(kind, None, len(PATTERNS))
+            worst = float(distance[selected].max())
+            holds = bool(kept[selected].all()) if np.isfinite(limit[selected]).all() else None
             measured = {"distance": worst, "gain": worst / size, "bound": analytical, "holds": holds}
             yield {"error": size, "pattern": pattern, **measured}
 
@@ -164,33 +164,34 @@ def swept_bounds(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """The distance to A on estimates, for bounds that end at multiples of the scenario's.
+    """The distance to A on estimates, for bounds whose final values are multiples of the scenario's.
 
-    After the observers' transient each run is paired with one from the same state whose law sees the truth: the floor.
-    The excess, by how much their distances differ, is what estimates cost (or, by luck, win). Every combination runs
-    with and without disturbances, with the scenario's observers ("as designed"), and with those that know neither
-    drift nor inputs ("bare", Theorem 2), whose errors don't vanish when the team agrees.
+    After the observers' transient each run is paired with a run from the same state whose law acts on true states; its
+    distance is the floor. The excess, the absolute difference of the two distances, is the effect of the estimates.
+    Every combination runs with and without disturbances, with the scenario's observers ("as designed"), and with
+    observers that use neither drift nor inputs ("bare", Theorem 2), whose errors don't vanish in agreement.
 
     Args:
-        scenario: fleet, graphs, observers, law; its bounds have to be `Exponential`.
-        factors: of delta(inf).
-        episodes: of each row.
-        seed: of the initial states and disturbances.
-        progress: told how far it is.
+        scenario: provides fleet, graphs, observers and law; its bounds must be `Exponential`.
+        factors: multiples of delta(inf).
+        episodes: number of episodes per row.
+        seed: seed of the initial states and disturbances.
+        progress: called with the completed fraction.
 
     Returns:
-        A row per factor, kind of observers, and with or without disturbance: observers, disturbed, factor, delta
-        (the smallest delta(inf) of a position, in m), error (largest norm of the errors that the law reads, in m),
-        floor, distance, excess (largest values of all episodes in the last quarter of a run, in m), bound (on
-        the distance, in m, by the comparison equation of `ComparisonGain` from the errors and disturbances measured at
-        the steps; None where these are too large for it), holds (whether every run kept it, to a relative 1e-4),
+        One row per factor, kind of observers, and with or without disturbance: observers, disturbed, factor, delta
+        (the smallest delta(inf) of a position, in m), error (largest norm of the errors in the law's arguments, in m),
+        floor, distance, excess (largest values over all episodes in the last quarter of a run, in m), bound (on the
+        distance, in m, by the comparison equation of `ComparisonGain` with the errors and disturbances measured at the
+        steps; None if these are too large for it), holds (whether every run stayed below it, to a relative 1e-4),
         normalized (largest |xi| / rho).
 
     Raises:
-        ValueError: for bounds that aren't `Exponential`.
-        DesignError: for a factor that no observers can be designed with, before anything is simulated.
-        UnfinishedError: for states drawn at a start that the observers can't start from; it holds the rows until then.
-        Interrupted: a KeyboardInterrupt that holds the same.
+        ValueError: if a bound isn't `Exponential`.
+        DesignError: if observers can't be designed for a factor, before any simulation.
+        UnfinishedError: if the observers can't start from a drawn initial state; its `partial` holds the rows until
+            then.
+        Interrupted: on Ctrl-C, with the same `partial`.
     """
     designs: list[tuple[str, bool, float]] = [
         (kind, disturbed, factor)
@@ -210,7 +211,7 @@ def swept_bounds(
         if not disturbed:
             variant = variant.replace(disturbance=None)
         try:
-            variant.build()  # refused now, and not after minutes of others
+            variant.build()  # design errors appear before the first simulation
         except DesignError as error:
             if kind == "bare":
                 continue  # inputs without a bound: they need their observers
@@ -232,7 +233,7 @@ def swept_bounds(
 
 
 def slope(rows: Sequence[Mapping[str, Any]], x: str, y: str) -> float | None:
-    """D log y / d log x, by least squares over rows where both are positive; None for fewer than two."""
+    """Slope of log y over log x by least squares, over rows in which both are positive; None for fewer than two."""
     points = np.log([(row[x], row[y]) for row in rows if row[x] > 0.0 and row[y] > 0.0])
     if len(points) < 2:
         return None
@@ -240,10 +241,10 @@ def slope(rows: Sequence[Mapping[str, Any]], x: str, y: str) -> float | None:
 
 
 def with_final_bounds(scenario: Scenario, factor: float) -> Scenario:
-    """The scenario with every delta(inf) multiplied, what is above it kept.
+    """The scenario with every delta(inf) scaled; the transient part delta(0) - delta(inf) stays.
 
     Raises:
-        ValueError: for bounds that aren't `Exponential`.
+        ValueError: if a bound isn't `Exponential`.
     """
 
     def scaled(bound: Any) -> Exponential:
@@ -256,14 +257,14 @@ def with_final_bounds(scenario: Scenario, factor: float) -> Scenario:
         return scenario.replace(delta=scaled(delta))
     return scenario.replace(
         delta={
-            kind: [scaled(one) for one in bound] if isinstance(bound, Sequence) else scaled(bound)
+            kind: [scaled(component) for component in bound] if isinstance(bound, Sequence) else scaled(bound)
             for kind, bound in delta.items()
         }
     )
 
 
 def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
-    """Runs on estimates, and from their states after the transient runs on the truth."""
+    """A row of `swept_bounds`: runs on estimates, paired after the transient with runs on true states."""
     run, oracle = (
         scenario.build(law=make_law(scenario.law), observe=mode, num_envs=episodes) for mode in ("estimate", "oracle")
     )
@@ -285,33 +286,36 @@ def _paired(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
             before = now
             continue
         oracle.step(scenario.dt)
-        mine, its = consensus_error(run.fleet, run.x), consensus_error(run.fleet, oracle.x)
+        on_estimates, on_truth = consensus_error(run.fleet, run.x), consensus_error(run.fleet, oracle.x)
         error = np.maximum(error, now[0])
         if comparison is not None:
             largest = np.maximum(now, before)
             limit = comparison.step(limit, largest[0], scenario.dt, largest[1])
-            kept &= bool(np.all(mine <= limit * (1.0 + _ROUNDING)))
+            kept &= bool(np.all(on_estimates <= limit * (1.0 + _ROUNDING)))
         before = now
         if step >= tail:
-            distance, floor = np.maximum(distance, mine), np.maximum(floor, its)
-            excess, allowed = np.maximum(excess, np.abs(mine - its)), np.maximum(allowed, limit)
-    bound = None if comparison is None else finite(float(allowed.max()))
+            distance, floor = np.maximum(distance, on_estimates), np.maximum(floor, on_truth)
+            excess = np.maximum(excess, np.abs(on_estimates - on_truth))
+            allowed = np.maximum(allowed, limit)
+    limit_reached = None if comparison is None else finite(float(allowed.max()))
     layout = scenario.design.states.layout
     positions = np.isin(layout.row_source, scenario.fleet.position_index)
     return {
-        "delta": min(one.infimum() for one, used in zip(scenario.design.states.bounds, positions, strict=True) if used),
+        "delta": min(
+            bound.infimum() for bound, used in zip(scenario.design.states.bounds, positions, strict=True) if used
+        ),
         "error": float(error.max()),
         "floor": float(floor.max()),
         "distance": float(distance.max()),
         "excess": float(excess.max()),
-        "bound": bound,
-        "holds": None if bound is None else kept,
+        "bound": limit_reached,
+        "holds": None if limit_reached is None else kept,
         "normalized": float(max(run.extremes.normalized.max(), run.extremes.input_normalized.max())),
     }
 
 
 class _Push:
-    """|Pi w| along a run that has been reset, in m/s."""
+    """Norm |Pi w| of the disturbance along a run that has been reset, in m/s."""
 
     def __init__(self, scenario: Scenario, run: Simulator) -> None:
         disturbance, self._run = scenario.disturbance, run
@@ -326,7 +330,7 @@ class _Push:
 
 
 def _read_columns(scenario: Scenario) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Columns of the estimates that the law reads, and of the states that they are estimates of."""
+    """Columns of the estimates that the law uses, and of the corresponding true states."""
     fleet, slot = scenario.fleet, scenario.design.states.layout.slot
     read, truth = [], []
     for i, j in directed(scenario.task).tolist():

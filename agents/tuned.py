@@ -1,4 +1,4 @@
-"""Parameters of the scripted policies where the user gives none: those that `khop tune` found, and their limits."""
+"""Default parameters of the scripted policies, found by `khop tune`, and the limit of gains in sampled control."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def _table() -> dict[str, Any]:
 
 
 def tuned_parameters(env: EnvDescription, law: str) -> dict[str, Any]:
-    """The shipped parameters of a law, or none.
+    """The shipped parameters of a law; empty if there are none.
 
-    Those for the scenario win over those for another member of its family ("random_geometric:..."). There are some for
-    observations with estimates, which serve on the truth, too, and some for local ones.
+    Parameters for the scenario take precedence over those for another member of its family ("random_geometric:...").
+    One set is for the modes "estimate" and "oracle", another for "local".
 
     Args:
-        env: environment, scenario and observation mode.
+        env: provides environment, scenario and observation mode.
         law: name of the law.
     """
     scenarios, family = _table().get(env.environment, {}), env.scenario.partition(":")[0]
@@ -32,16 +32,16 @@ def tuned_parameters(env: EnvDescription, law: str) -> dict[str, Any]:
 
 
 def sampled_gain(gain: float, averages: bool, env: EnvDescription) -> float:
-    """The largest gain up to `gain` that an environment's control period allows.
+    """The gain, lowered if the environment's control period is too long for it.
 
-    A velocity k times the sum over an agent's d edges (the mean: d = 1), held for T, keeps every agent within the hull
-    of its neighbours as long as k d T <= 1 (Gershgorin's circles of I - k T L). A gain that was tuned nearer to the
-    limit of stability than that keeps its distance: k T stays what it was at the period of tuning.
+    A velocity of k times the sum over an agent's d edges (the mean: d = 1), held for T, keeps every agent within the
+    hull of itself and its neighbours if k d T <= 1 (Gershgorin's circles of I - k T L). A gain tuned above this limit
+    keeps its product k T at the control period of tuning.
 
     Args:
         gain: in 1/s.
         averages: whether the law takes the mean over edges.
-        env: where it acts.
+        env: provides control period and task edges.
     """
     period = env.control_period
     most = max(sum(slot.task_edge for slot in layout.slots) for layout in env.layouts.values())

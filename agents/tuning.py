@@ -1,4 +1,4 @@
-"""Tuning the scripted policies: a pattern search on the mean return over fixed episodes."""
+"""Tune the scripted policies: a pattern search on the mean return over fixed episodes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from agents.scripted import LawPolicy
 from agents.workers import Interrupted
 
 SEEDS = range(10_000, 10_064)
-"""Episodes that parameters are tuned on; others than those that evaluation plays by default."""
+"""Seeds of the tuning episodes; they differ from the default evaluation seeds."""
 
 _FACTORS = (0.25, 0.5, 2**-0.5, 2**-0.25, 2**0.25, 2**0.5, 2.0, 4.0)
 _STEPS = (-0.2, -0.1, -0.05, 0.05, 0.1, 0.2)  # of parameters from 0 to 1
-_WORTH = 1e-4  # relative improvement that a change has to bring
+_WORTH = 1e-4  # least relative improvement of an accepted change
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Tuned:
     """The best parameters found.
 
     Attributes:
-        parameters: by name.
+        parameters: values by name.
         mean_return: over the tuning episodes.
-        default_return: the law's defaults over the same.
-        trials: parameter sets played.
+        default_return: mean return of the default parameters over the same episodes.
+        trials: number of parameter sets evaluated.
     """
 
     parameters: dict[str, Any]
@@ -42,25 +42,25 @@ class Tuned:
 def tune(
     env: object, law: str, seeds: Sequence[int] = SEEDS, *, progress: Callable[[float], None] | None = None
 ) -> Tuned:
-    """Change one parameter after the other, as long as the mean return grows.
+    """Change one parameter after the other while the mean return increases.
 
-    Positive parameters are multiplied by up to 4, those from 0 to 1 moved by up to 0.2, and switches flipped.
+    Positive parameters are scaled by up to 4, those from 0 to 1 shifted by up to 0.2, and booleans flipped.
 
     Args:
-        env: an environment of khop_env; its copies are played at once.
+        env: an environment of khop_env; num_envs episodes run at a time.
         law: one of `LAWS`.
-        seeds: of the episodes.
-        progress: told, roughly, how far it is.
+        seeds: seeds of the tuning episodes.
+        progress: called with the estimated completed fraction.
 
     Returns:
-        Parameters to three digits. An optimum of this search need not be the global one.
+        The best parameters found, to three digits. The search is local and may miss the global optimum.
 
     Raises:
-        ValueError: if the law doesn't work with its default parameters.
-        Interrupted: a KeyboardInterrupt that holds the best until then.
+        ValueError: if the mean return with default parameters isn't finite.
+        Interrupted: on Ctrl-C; its `partial` holds the best parameters until then.
     """
     batched = batched_of(env)
-    names = [one.name for one in fields(LAWS[law])]  # type: ignore[arg-type]
+    names = [field.name for field in fields(LAWS[law])]  # type: ignore[arg-type]
     signature = inspect.signature(LAWS[law]).parameters
     best = {name: signature[name].default for name in names}
     known: dict[tuple[Any, ...], float] = {}
@@ -73,7 +73,9 @@ def tune(
 
     default = top = value(best)
     if not math.isfinite(default):
-        raise ValueError(f"{law!r} with its default parameters returns {default} in {describe(batched).environment}")
+        raise ValueError(
+            f"{law!r} with its default parameters has mean return {default} in {describe(batched).environment}"
+        )
     improved, rounds = True, 0
     try:
         while improved and rounds < 6:

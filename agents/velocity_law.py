@@ -1,4 +1,4 @@
-"""What the feedback laws have in common: a velocity command from task edges, turned into each model's own inputs."""
+"""Base class of the feedback laws: velocity commands from task edges, converted to each model's inputs."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ VELOCITY_INPUTS = ("integrator", "drifter")  # types of agents with x' = f(x) + 
 
 
 class VelocityLaw:
-    """A law that commands velocities; a subclass is a dataclass of parameters, and writes `command`.
+    """A law that commands velocities; a subclass is a dataclass of its parameters and implements `command`.
 
-    Velocities go to agents whose input is a velocity (x' = f(x) + u) as they stand, with `cancel_drift` less the
-    agent's own f(x), and to other models through `physics.velocity_to_input`; always within the input limits. Edges of
-    whose other end an agent knows nothing have displacement zero: they contribute nothing.
+    For agents whose input is a velocity (x' = f(x) + u) the command is the input, with `cancel_drift` minus the agent's
+    own f(x); for other models `physics.velocity_to_input` converts it. Inputs are clipped at their limits. Edges to
+    agents without a valid estimate or state have displacement zero and contribute nothing.
 
     Attributes:
         cancel_drift: whether agents whose input is a velocity subtract their known drift.
-        gain: in 1/s, of laws that have one.
-        averages: whether a command is the gain times a mean over an agent's edges, and not times their sum.
+        gain: in 1/s, for laws with a gain.
+        averages: whether a command is the gain times the mean over an agent's edges, not times their sum.
     """
 
     cancel_drift: bool = False
@@ -39,7 +39,7 @@ class VelocityLaw:
         raise NotImplementedError(f"{type(self).__name__} has no command(view, displacement, velocity)")
 
     def speed_limit(self, most_edges: int) -> float:
-        """No component of a command exceeds it, in m/s, where an agent has so many edges; infinite by default."""
+        """Bound on each component of a command in m/s, for up to `most_edges` task edges per agent; inf by default."""
         return math.inf
 
     def __call__(self, t: FloatArray, view: View) -> FloatArray:
@@ -59,13 +59,13 @@ class VelocityLaw:
         return self._u
 
     def __getstate__(self) -> dict[str, Any]:
-        return {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
 
     def require_positive(self, *names: str) -> None:
-        """Refuse parameters that aren't positive and finite.
+        """Check that parameters are positive and finite.
 
         Raises:
-            ValueError: naming the parameter.
+            ValueError: if one isn't; the message names it.
         """
         for name in names:
             value = getattr(self, name)
@@ -77,7 +77,7 @@ class VelocityLaw:
         self._view = view
         self._velocity = np.zeros((len(fleet), fleet.position_dim, batch))
         self._u = np.zeros((batch, fleet.m))
-        # commands that can't exceed the limits of integrators are their inputs as they stand
+        # if commands can't exceed the limits of integrators, they are the inputs
         most = self.speed_limit(int(np.bincount(view.edges[:, 0], minlength=len(fleet)).max(initial=0)))
         self._direct = not self.cancel_drift and all(
             group.model.type in VELOCITY_INPUTS and np.all(group.model.input_limit >= most) for group in fleet.groups

@@ -1,4 +1,4 @@
-"""The same work in several processes of this machine, which end with the caller, however that ends."""
+"""Run independent tasks in several local processes, which end with the caller in any case."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
+from khop_env.own_agents import call_pickled
+
 
 class WorkerError(RuntimeError):
-    """A worker process ended before its work did."""
+    """A worker process ended before its task was finished."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C.
+    """A KeyboardInterrupt (Ctrl-C) with the results until then.
 
     Attributes:
-        partial: what there was until then, in the form of what would have been returned.
+        partial: the results until then, of the same type as the function's return value.
     """
 
     def __init__(self, partial: Any) -> None:
@@ -29,10 +31,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 class UnfinishedError(RuntimeError):
-    """Something failed on the way; the message says what, and `__cause__` is the error itself.
+    """An error after some results were obtained; the message describes it, and `__cause__` is the exception itself.
 
     Attributes:
-        partial: what there was until then, in the form of what would have been returned.
+        partial: the results until then, of the same type as the function's return value.
     """
 
     def __init__(self, message: str, partial: Any) -> None:
@@ -41,29 +43,29 @@ class UnfinishedError(RuntimeError):
 
 
 def run_in_processes(function: Callable[[Any], Any], tasks: Sequence[Any], workers: int) -> Iterator[tuple[int, Any]]:
-    """Number and result of each task, as they come.
+    """Yield the index and result of each task in order of completion.
 
-    Whoever stops asking for results, by an exception or `close()`, ends the workers in the middle of their tasks.
+    Closing the generator, also by an exception, kills the workers in the middle of their tasks.
 
     Args:
-        function: what to run; each worker gets a copy of its own, once.
-        tasks: its arguments.
-        workers: how many processes.
+        function: called with each task; it is copied to each worker once.
+        tasks: arguments of `function`.
+        workers: number of processes.
 
     Raises:
-        WorkerError: if a worker is killed, or can't start.
-        ValueError: if `function` can't be sent to them.
-        Exception: what `function` raises for a task.
+        WorkerError: if a worker is killed or can't start.
+        ValueError: if `function` can't be pickled.
+        Exception: if `function` raises it for a task.
     """
     waiting, pool = iter(enumerate(tasks)), dict[Connection, SpawnProcess]()
     try:
-        ForkingPickler.dumps(function)
-    except Exception as error:  # pickle raises all kinds
-        raise ValueError(f"this can't be sent to other processes, take one worker ({error})") from error
+        pickled = bytes(ForkingPickler.dumps((_serve, function)))
+    except Exception as error:  # pickle raises various exceptions
+        raise ValueError(f"can't be sent to other processes; use workers=1 ({error})") from error
     try:
         with _sigint_blocked():
             for _ in range(min(workers, len(tasks))):
-                connection, process = _started(function)
+                connection, process = _started(pickled)
                 pool[connection] = process
         running = {connection: _assign(connection, waiting) for connection in pool}
         while busy := [connection for connection, number in running.items() if number is not None]:
@@ -74,26 +76,26 @@ def run_in_processes(function: Callable[[Any], Any], tasks: Sequence[Any], worke
                 yield number, result
     finally:
         for process in pool.values():
-            process.kill()  # they have nothing to tidy up
+            process.kill()  # they have nothing to clean up
         for connection, process in pool.items():
             process.join()
             connection.close()
 
 
-def _started(function: Callable[[Any], Any]) -> tuple[Connection, SpawnProcess]:
+def _started(pickled: bytes) -> tuple[Connection, SpawnProcess]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_serve, args=(theirs, function), daemon=True)
+    process = context.Process(target=call_pickled, args=(pickled, theirs), daemon=True)
     process.start()
     theirs.close()
     return ours, process
 
 
 def _assign(connection: Connection, waiting: Iterator[tuple[int, Any]]) -> int | None:
-    """The number of the next task, which has been sent; None where there are no more."""
+    """Send the next task and return its index; None if there are no more."""
     number, task = next(waiting, (None, None))
     if number is not None:
-        with contextlib.suppress(OSError):  # a worker that is gone is found by what it doesn't answer
+        with contextlib.suppress(OSError):  # a dead worker is detected when its result is received
             connection.send(task)
     return number
 
@@ -105,17 +107,17 @@ def _received(connection: Connection, process: SpawnProcess) -> Any:
         process.join()
         code = process.exitcode or 0
         if code < 0:
-            how = f"was killed by {signal.Signals(-code).name} (where memory is short, use fewer)"
+            how = f"was killed by {signal.Signals(-code).name} (use fewer workers if memory is short)"
         else:
-            how = f"ended with status {code} (a script that starts some does so under if __name__ == '__main__')"
+            how = f"ended with status {code} (a script must start workers under if __name__ == '__main__')"
         raise WorkerError(f"a worker process {how}") from None
     if not good:
         raise result
     return result
 
 
-def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
-    """What a worker does: tasks, until nobody sends any. Ctrl-C is for the caller alone."""
+def _serve(function: Callable[[Any], Any], connection: Connection) -> None:
+    """Main loop of a worker: run tasks until the connection closes. Only the caller handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -129,7 +131,7 @@ def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
 
 @contextlib.contextmanager
 def _sigint_blocked() -> Iterator[None]:
-    """Processes started meanwhile don't get Ctrl-C before they can ignore it; ours comes afterwards."""
+    """Block Ctrl-C in processes started meanwhile until they ignore it; this process receives it afterwards."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -1,6 +1,6 @@
-"""The benchmark: what the proximal step saves, how far it is from the bare arithmetic, and how it grows.
+"""The benchmark: speed of the proximal step, its overhead over the bare arithmetic, and its growth with the fleet.
 
-Every figure is a ratio of times taken in this run, each the best of several repeats, or a memory size.
+Every value is a ratio of times measured in this run, each the best of several repeats, or a memory size.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from benchmarks.environments import environment_rows
 from benchmarks.report import Report, reason
 from benchmarks.training import training_rows
 from benchmarks.yardsticks import CompiledPaper, bare_loop
+from khop_env.extras import how_to_install
 from khop_env.observers import FloatArray, Proximal
 from khop_env.observers.solve import solve
 from khop_env.scenarios import Scenario, paper, random_geometric
 from khop_env.simulation import Simulator
 
 DURATION = 10.0  # s, of the closed loop
-ACCURACY = 2e-3  # largest error of x that a method may make over it
+ACCURACY = 2e-3  # largest admissible error of x of a method over it
 DT = 0.01
 EXPLICIT_DT = 1e-5
 BATCH = 64
@@ -46,10 +47,10 @@ class Part:
     """Some rows of the table.
 
     Attributes:
-        name: what is measured.
-        measure: adds the rows.
-        needs: packages that the core doesn't install.
-        rows: names of the rows that there are not without these packages.
+        name: name of the measurement.
+        measure: measures and adds the rows.
+        needs: required packages that aren't dependencies of the core.
+        rows: names of the rows that need these packages.
     """
 
     name: str
@@ -59,18 +60,18 @@ class Part:
 
 
 def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path | None = None) -> dict[str, Any]:
-    """Run all benchmarks; those whose packages aren't installed are left out, and an interrupt ends with what there is.
+    """Run all benchmarks; parts without their packages are left out, and an interrupt returns the rows until then.
 
     Args:
-        quick: a hundredth of the work, to see that everything runs; the figures mean little.
-        progress: called with a line for each part that is left out, before anything is measured; then before each part.
-        peers: folder with virtual environments of other libraries to compare environments with; None to leave it out.
+        quick: whether to do a hundredth of the work, as a test; the values mean little.
+        progress: called with a line for each part that is left out, and then before each part.
+        peers: folder with virtual environments of other libraries to compare with; None for no comparison.
 
     Returns:
         "machine"; "rows", see `Report`; "failed", the parts that ended with an error; and "interrupted".
 
     Raises:
-        ValueError: if there is no peer in `peers`.
+        ValueError: if `peers` has no virtual environment of a peer.
     """
     say = progress or (lambda line: None)
     report = Report()
@@ -111,7 +112,7 @@ def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path
             say(part.name)
             try:
                 part.measure()
-            except Exception as error:  # the other parts' rows are worth having
+            except Exception as error:  # other parts still run
                 report.skip(part.name, f"failed: {reason(error)}")
                 say(f"{part.name} failed: {reason(error)}")
                 failed.append(part.name)
@@ -128,7 +129,7 @@ def _installed(package: str) -> bool:
 
 
 def _to_install(packages: Sequence[str]) -> str:
-    return f"needs {' and '.join(packages)}: pip install -c constraints.txt -e '.[bench]'"
+    return f"needs {' and '.join(packages)}: {how_to_install('bench')}"
 
 
 def _best(action: Callable[[], object], repeats: int) -> float:
@@ -145,12 +146,14 @@ def _simulator(scenario: Scenario, batch: int, order: int = 2) -> Simulator:
     return scenario.build(law=make_law(scenario.law), observers=Proximal(order), num_envs=batch)
 
 
-def _run(simulator: Simulator, dt: float, duration: float, watch: Callable[[FloatArray], object] | None = None) -> None:
+def _run(
+    simulator: Simulator, dt: float, duration: float, on_step: Callable[[FloatArray], object] | None = None
+) -> None:
     simulator.reset(seed=0)
     for _ in range(round(duration / dt)):
         simulator.step(dt)
-        if watch is not None:
-            watch(simulator.x[0].copy())
+        if on_step is not None:
+            on_step(simulator.x[0].copy())
 
 
 def _trajectory(dt: float, duration: float, every: int = 1) -> FloatArray:
@@ -173,7 +176,7 @@ def _against_explicit(add: Callable[..., None], quick: bool) -> None:
         simulator.reset(seed=0)
         loop = CompiledPaper(simulator)
         loop.run(EXPLICIT_DT, 10)
-        steps = 200 if quick else (20_000 if batch > 1 else 200_000)  # of equal cost, so a part of the 10 s will do
+        steps = 200 if quick else (20_000 if batch > 1 else 200_000)  # of equal cost, so a part of the 10 s is enough
         explicit = _best(partial(loop.run, EXPLICIT_DT, steps), 2) / (steps * EXPLICIT_DT)
         add(f"speedup_vs_explicit{suffix}", explicit / proximal, target=target)
         elements = 2 * simulator.design.states.layout.size * batch  # state and input observers
@@ -191,7 +194,7 @@ def _bare_time(elements: int, repeats: int) -> float:
 
 
 def _against_scipy(report: Report, quick: bool, say: Progress) -> None:
-    """The loosest tolerance of each stiff solver that keeps the accuracy, on the same right-hand side, compiled."""
+    """Time of SciPy's stiff solvers, at the loosest tolerance with the required accuracy, on the compiled equations."""
     from scipy.integrate import solve_ivp
 
     duration = 0.2 if quick else DURATION
@@ -215,7 +218,7 @@ def _against_scipy(report: Report, quick: bool, say: Progress) -> None:
                     found = solve_ivp(
                         loop.derivative, (0.0, duration), start, method, t_eval=times, rtol=tolerance, atol=tolerance
                     )
-            except ValueError:  # a Jacobian there, and SciPy gives up
+            except ValueError:  # a Jacobian at such a point
                 continue
             elapsed = time.perf_counter() - began
             kept = found.success and np.abs(found.y[: reference.shape[1]].T - reference).max() <= ACCURACY
@@ -223,7 +226,7 @@ def _against_scipy(report: Report, quick: bool, say: Progress) -> None:
                 say(f"  {method}: rtol = atol = {tolerance:g}, {elapsed:.2f} s")
                 best = min(best, elapsed)
                 break
-            if elapsed > 10.0 * ours * 1000.0:  # hopeless: a thousandfold already
+            if elapsed > 10.0 * ours * 1000.0:  # already a thousand times slower
                 break
         else:
             say(f"  {method}: {ACCURACY:g} not reached with rtol down to 1e-4")
@@ -246,7 +249,7 @@ def _ratio_to_floor(quick: bool, batch: int = 1024) -> float:
     rho = np.empty((layout.rows, simulator.num_envs))
     estimate, slope = np.empty_like(state.memory["estimate"]), np.empty_like(state.memory["estimate"])
     seconds, evaluations = 0.0, 0
-    for _ in range(3 if quick else 50):  # along a run, so that the warm starts are those of one
+    for _ in range(3 if quick else 50):  # along a run, for realistic warm starts
         simulator.step(DT)
         predictor, eps = state.memory["estimate"] + tau * DT, state.memory["eps"].copy()
         simulator.design.states.rho.evaluate(state.t, rho)
@@ -260,7 +263,7 @@ def _ratio_to_floor(quick: bool, batch: int = 1024) -> float:
 
 
 def _growth(add: Callable[..., None], quick: bool, say: Progress) -> None:
-    """Time and memory per pair of `random_geometric`, one environment each; the sizes take turns, best of many."""
+    """Time and memory per pair of `random_geometric`, num_envs = 1; sizes alternate, best of several."""
     sizes = (100, 1000) if quick else (100, 1000, 10_000)
     simulators, pairs, held = [], [], []
     for agents in sizes:

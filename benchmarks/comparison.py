@@ -16,21 +16,21 @@ NAMES = ("mpe2", "vmas", "jaxmarl")  # of the virtual environments
 
 
 def left_out(peers: Path | None) -> list[str]:
-    """The peers that aren't installed, a line each.
+    """Peers that aren't installed, one line per peer.
 
     Args:
-        peers: folder with one virtual environment per peer; None if no ratios were asked for.
+        peers: folder with one virtual environment per peer; None for no ratios.
 
     Raises:
-        ValueError: if there is none of them.
+        ValueError: if no peer is installed.
     """
     if peers is None:
         return []
     missing = [peer for peer in NAMES if not _python(peers, peer).exists()]
     if len(missing) == len(NAMES):
         raise ValueError(
-            f"--peers {peers}: expected virtual environments named {', '.join(NAMES)} in it, as `make bench PEERS=1` "
-            "makes them in .peers; found none"
+            f"--peers {peers}: expected virtual environments named {', '.join(NAMES)} in it, as created "
+            "by `make bench PEERS=1` in .peers; found none"
         )
     return [f"ratios to {peer} ({_not_installed(peers, peer)})" for peer in missing]
 
@@ -49,42 +49,43 @@ def compare(
 
     Args:
         report: takes the rows.
-        name: of the row.
-        unit: of both rates.
-        ours: measures once.
-        theirs: measures the peer once, with the Python of its environment.
-        peer: folder of the environments, None if no ratios were asked for; and the peer's name.
+        name: name of the row.
+        unit: unit of both rates.
+        ours: measures this library once.
+        theirs: measures the peer once, with the Python of its virtual environment.
+        peer: folder of the virtual environments, or None for no ratios; and the peer's name.
         ratio: unit and target of the ratio.
-        turns: times that the two sides measure, in turns, so that the machine's mood meets both; once without a peer.
+        turns: number of alternating measurements of both sides, so that the load of the machine affects both; 1 without
+            a peer.
     """
     folder, peer_name = peer
     python = None if folder is None else _python(folder, peer_name)
     missing = None
     if folder is not None and python is not None and not python.exists():
         python, missing = None, _not_installed(folder, peer_name)
-    mine, others = [], []
+    own, others = [], []
     for _ in range(turns if python is not None else 1):
-        mine.append(ours())
+        own.append(ours())
         if python is not None and missing is None:
             try:
                 others.append(theirs(python))
             except (OSError, subprocess.CalledProcessError, LookupError, ValueError) as error:
                 missing = f"{peer_name} failed: {reason(error)}"
-    report.add(name, statistics.median(mine), unit)
+    report.add(name, statistics.median(own), unit)
     if missing is not None:
         report.skip(f"{name}_ratio", missing)
     elif others:
-        report.add(f"{name}_ratio", statistics.median(mine) / statistics.median(others), *ratio)
+        report.add(f"{name}_ratio", statistics.median(own) / statistics.median(others), *ratio)
 
 
 def run_peer(python: Path, script: str, *arguments: float, threads: int = 1) -> float:
     """Agent-steps per second that a script of `peers/` prints.
 
     Args:
-        python: of the environment that the peer is installed in.
-        script: its file name.
-        arguments: of the script.
-        threads: that the peer's own libraries may use.
+        python: Python of the peer's virtual environment.
+        script: file name of the script.
+        arguments: arguments of the script.
+        threads: number of threads of the peer's libraries.
     """
     command = [str(python), str(SCRIPTS / script), *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}

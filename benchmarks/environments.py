@@ -1,4 +1,4 @@
-"""How fast the environments step: where the time goes, and against bare particle worlds, taking turns with them."""
+"""Speed of the environments: shares of a step's parts, and ratios to particle environments, measured in alternation."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from khop_env import consensus_v0
 from khop_env.env import BatchedEnv, KHopEnv, Settings
 
 BATCH = 1024
-TURNS = 5  # of the two sides of a ratio
+TURNS = 5  # repetitions of both sides of a ratio
 Rate = Callable[[float], float]
-"""Agent-steps per second, measured for about so many seconds."""
+"""Agent-steps per second; the argument is the time to measure in s."""
 
 
 def single(scenario: str, order: int) -> tuple[KHopEnv, Callable[[int], None]]:
@@ -43,7 +43,7 @@ def single_rate(seconds: float, scenario: str, order: int) -> float:
 
 
 def batched(scenario: str, order: int, threads: int, batch: int = BATCH) -> tuple[BatchedEnv, Callable[[int], None]]:
-    """A batched environment and a step with random actions that resets what has ended."""
+    """A batched environment and a step with random actions that resets finished environments."""
     env = consensus_v0.batched_env(scenario, num_envs=batch, order=order, threads=threads)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -65,7 +65,7 @@ def vector_rate(seconds: float, scenario: str, order: int, threads: int, batch: 
 
 
 def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str, float]:
-    """Microseconds per copy and step spent in each part of `step`, which steps `env`."""
+    """Microseconds per environment and step in each part of `step`, which steps `env`."""
     for number in range(5):
         step(number)
     simulator: Any = env.simulator
@@ -88,7 +88,7 @@ def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str
 
 
 def environment_rows(report: Report, quick: bool, say: Callable[[str], None], peers: Path | None) -> None:
-    """Measure rates and shares; and ratios to the peers installed in the environments under `peers`.
+    """Measure rates, shares, and ratios to the peers installed under `peers`.
 
     Args:
         report: takes the rows.
@@ -103,9 +103,9 @@ def environment_rows(report: Report, quick: bool, say: Callable[[str], None], pe
     add("environment_substeps", settings.substeps, "simulator steps in a control period")
     for scenario in ("paper", "convoy"):
         say(f"environments: where a step spends its time on {scenario}, one copy and {batch}")
-        one, step_one = single(scenario, 1)
+        alone, step_alone = single(scenario, 1)
         many, step_many = batched(scenario, 1, 1, batch)
-        for kind, env, step, steps in (("single", one.batched, step_one, 3000), ("vector", many, step_many, 60)):
+        for kind, env, step, steps in (("single", alone.batched, step_alone, 3000), ("vector", many, step_many, 60)):
             for part, value in shares(env, step, 3 if quick else steps).items():
                 add(f"{kind}_{scenario}: {part}", value, "us per copy and step")
 

@@ -2,7 +2,7 @@
 
     .venv/bin/python -m benchmarks.publish_table
 
-What has finished isn't trained again (runs/study); the pretrained policies are those that seed 0 trained on estimates.
+Finished runs aren't repeated (runs/study); the pretrained policies are those trained on estimates with seed 0.
 """
 
 import argparse
@@ -26,10 +26,10 @@ parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of t
 
 
 def main() -> None:
-    """Train what isn't trained yet, measure, write."""
-    given = parser.parse_args()
-    train_all(given.root, workers=given.workers, say=lambda text: print(text, flush=True))
-    blocks = [measure(given.root, task, workers=given.workers) for task in TASKS]
+    """Run missing trainings, measure, and write the files."""
+    options = parser.parse_args()
+    train_all(options.root, workers=options.workers, say=lambda text: print(text, flush=True))
+    blocks = [measure(options.root, task, workers=options.workers) for task in TASKS]
     hours = sum(block.seconds for block in blocks) / 3600.0
     ratios = [largest_ratio(block) for block in blocks]
     worst, late, bound = (max(column) for column in zip(*ratios, strict=True))
@@ -40,32 +40,32 @@ def main() -> None:
         f"Written by `python -m benchmarks.publish_table` on {date.today().isoformat()}: {len(SEEDS)} training "
         f"seeds for each kind of observation, {len(EPISODES)} evaluation episodes, the same for every row and other "
         f"than those that policies were trained, selected or tuned on. The trainings took {hours:.1f} hours of wall "
-        f"time added up, {given.workers} at a time on {os.cpu_count()} shared cores ({platform.machine()}, no GPU); "
-        f"agent-steps of each run: {budgets}. The policy that is played of each run is the best of "
+        f"time added up, {options.workers} at a time on {os.cpu_count()} shared cores ({platform.machine()}, no GPU); "
+        f"agent-steps of each run: {budgets}. The evaluated policy of each run is the best of "
         f"{TrainingConfig('consensus_v0').evaluations} evaluations on {len(EVALUATION_SEEDS)} further episodes.\n",
         "Returns are means over agents of an episode's sum; ± is the 95 % interval over episodes, of learned policies "
-        "after averaging over training seeds. Scripts play with the parameters that `khop tune` found for the "
-        "environment and the scenario, on estimates (which serve on the truth, too) or on neighbours only. A verdict "
+        "after averaging over training seeds. Scripts have the parameters that `khop tune` found for the "
+        "environment and the scenario, on estimates (also used on true states) or on neighbours only. A verdict "
         "needs intervals over episodes and over training seeds that both exclude 0.\n",
         f"{kept}, of learned, scripted, random and bang-bang policies alike: largest |e| {worst:.4f} over all time, "
         f"{late:.4f} after the first quarter of an episode, largest error over its bound {bound:.4f}; the guarantee is "
         "that all are below 1.\n",
-        "In consensus an agent can meet the others without hearing anybody: it goes to the origin, where initial sets "
-        "are centred. The script `leader_following` does that on neighbours only, and a network can learn it; in plain "
-        "consensus over a connected network estimates are not what decides. They are where a reference is out of "
-        "earshot and moves.\n",
+        "In consensus an agent can meet the others without communication: it goes to the origin, where initial sets "
+        "are centred. The script `leader_following` does so on neighbours only, and a network can learn it; in plain "
+        "consensus estimates aren't decisive. They are where an agent follows a moving reference that isn't its "
+        "neighbour.\n",
         "![Learning curves](learning.png)\n",
     ]
     for block in blocks:
         text += table(block)
-    given.docs.mkdir(parents=True, exist_ok=True)
-    (given.docs / "learning.md").write_text("\n".join(text).rstrip() + "\n")
+    options.docs.mkdir(parents=True, exist_ok=True)
+    (options.docs / "learning.md").write_text("\n".join(text).rstrip() + "\n")
     curves = {block.task.label: (block.timesteps, block.curves) for block in blocks}
-    learning_curves(curves, given.docs / "learning.png")
+    learning_curves(curves, options.docs / "learning.png")
     PRETRAINED.mkdir(exist_ok=True)
     for task in TASKS:
         name = describe(make_batched(task.environment, task.scenario)).scenario
-        best = folder_of(given.root, task, "estimate", 0) / "best.npz"
+        best = folder_of(options.root, task, "estimate", 0) / "best.npz"
         shutil.copyfile(best, PRETRAINED / f"{pretrained_name(task.environment, name)}.npz")
     print("\n".join(text))
 

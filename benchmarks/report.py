@@ -1,4 +1,4 @@
-"""What the benchmark has measured so far, and why something is missing."""
+"""Results of the benchmark, with reasons for missing values."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ class Report:
     """Rows of the table in the order in which they are measured.
 
     Attributes:
-        rows: each with name, value, unit, target (the bound that the project sets itself) and skipped: None, or why
-            there is no value.
+        rows: dicts of name, value, unit, target (the bound set by the project) and skipped (None, or the reason why
+            there is no value).
     """
 
     def __init__(self) -> None:
@@ -26,12 +26,12 @@ class Report:
             self.rows.append({"name": name, "value": float(value), "unit": unit, "target": target, "skipped": None})
 
     def skip(self, name: str, reason: str) -> None:
-        """Add a row without a value, and why it has none."""
+        """Add a row without a value, with the reason."""
         self.rows.append({"name": name, "value": None, "unit": "", "target": "", "skipped": reason})
 
 
 def reason(error: Exception) -> str:
-    """Why something failed, in one line; of a process that is its last word."""
+    """An error in one line; for a failed process the last line of its error output."""
     if isinstance(error, subprocess.CalledProcessError):
         lines = (error.stderr or "").strip().splitlines()
         return lines[-1] if lines else f"exit status {error.returncode}"

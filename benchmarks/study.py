@@ -1,7 +1,6 @@
 """The published table: policies trained on estimates, the truth, and neighbours only, beside tuned scripts.
 
-Every run is kept in a folder of its own, and one that has finished isn't trained again, so that a study that was
-interrupted goes on where it was.
+Every run has a folder of its own, and finished runs aren't repeated, so that an interrupted study can be continued.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ SCRIPTS = ("tanh", "linear", "formation", "leader_following")
 SEEDS = range(5)
 EPISODES = range(100)
 DONE = "finished"
-WITHIN = 3.0  # percent: how near policies that learn on estimates are meant to come to those that learn on the truth
+WITHIN = 3.0  # percent: aim for the difference between policies trained on estimates and on true states
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,8 @@ class StudyTask:
     """One block of the table.
 
     Attributes:
-        environment: its name.
-        scenario: its name.
+        environment: name of the environment.
+        scenario: name of the scenario.
         timesteps: agent-steps of each training.
     """
 
@@ -45,7 +44,7 @@ class StudyTask:
 
     @property
     def label(self) -> str:
-        """For files and titles."""
+        """Name in titles."""
         return f"{self.environment} on {self.scenario}"
 
 
@@ -63,7 +62,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "local": {"observe": "local"},
     "estimate + bounds": {"observe": "estimate", "bounds": True},
 }
-"""What is trained on."""
+"""Observations of the trainings, by name of the variant."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +70,10 @@ class Learned:
     """One variant's policies, played on one kind of observation.
 
     Attributes:
-        variant: what they were trained on.
-        observe: what they are played on.
-        returns: (seeds, episodes).
-        rows: one per training seed.
+        variant: name of the observations in training.
+        observe: observation mode in the evaluation.
+        returns: (seeds, episodes) returns.
+        rows: results per training seed.
     """
 
     variant: str
@@ -84,7 +83,7 @@ class Learned:
 
     @property
     def label(self) -> str:
-        """E.g. "PPO trained on oracle, played on estimate"."""
+        """Name in the table, e.g. "PPO trained on oracle, on estimate"."""
         if self.variant in (self.observe, f"{self.observe} + bounds"):
             return f"PPO on {self.variant}"
         return f"PPO trained on {self.variant}, on {self.observe}"
@@ -95,12 +94,12 @@ class Block:
     """Everything measured of one task.
 
     Attributes:
-        task: which.
+        task: the task.
         scripts: rows of the scripted policies under all observation modes, and of bang-bang adversaries.
-        learned: those of the learned ones.
+        learned: results of the learned policies.
         curves: {variant: (seeds, evaluations)} learning curves, mean returns.
         timesteps: (evaluations,) of the curves.
-        seconds: of training, all runs added up.
+        seconds: time of training in s, sum of all runs.
     """
 
     task: StudyTask
@@ -112,16 +111,16 @@ class Block:
 
 
 def folder_of(root: Path, task: StudyTask, variant: str, seed: int) -> Path:
-    """Where a run is kept."""
+    """Folder of a run."""
     scenario = task.scenario.replace(":", "-").replace("=", "")
     return root / f"{task.environment}-{scenario}" / f"{variant.replace(' + ', '-')}-{seed}"
 
 
 def seconds_of(folder: Path) -> float | None:
-    """How long the finished training of a folder took, in s; None where it hasn't finished, or its mark is damaged.
+    """Duration of the finished training of a folder in s; None if it hasn't finished, or its mark is damaged.
 
     Args:
-        folder: of one run.
+        folder: folder of a run.
     """
     try:
         return float((folder / DONE).read_text())
@@ -137,14 +136,14 @@ def train_all(
     workers: int = 2,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Train what hasn't been trained yet, in several processes.
+    """Run the missing trainings in several processes.
 
     Args:
         root: folder of the study.
         tasks: blocks of the table.
         seeds: training seeds.
-        workers: processes.
-        say: told of every run that ends.
+        workers: number of processes.
+        say: called with a line after every run.
     """
     jobs = [
         (root, task, variant, seed)
@@ -162,14 +161,14 @@ def train_all(
 def measure(
     root: Path, task: StudyTask, seeds: Sequence[int] = SEEDS, episodes: Sequence[int] = EPISODES, *, workers: int = 2
 ) -> Block:
-    """Play everything of one task over the same episodes.
+    """Evaluate all policies of one task over the same episodes.
 
     Args:
         root: folder of the study.
-        task: which block.
+        task: the task.
         seeds: training seeds.
         episodes: seeds of the episodes.
-        workers: processes.
+        workers: number of processes.
     """
 
     def played(policies: Sequence[str], observe: Sequence[Observe]) -> Comparison:
@@ -197,7 +196,7 @@ def measure(
             found.append(np.loadtxt(folder / "curve.csv", delimiter=",", skiprows=1))
             seconds += seconds_of(folder) or 0.0
         shortest = min(map(len, found))
-        curves[variant] = np.array([one[:shortest, 1] for one in found])
+        curves[variant] = np.array([curve[:shortest, 1] for curve in found])
         steps = found[0][:shortest, 0]
     return Block(task, scripts, learned, curves, steps, seconds)
 
@@ -231,12 +230,14 @@ def table(block: Block) -> Iterator[str]:
 def rates_of(name: str) -> str:
     """The rates at which a scenario's bounds on state estimates fall, in 1/s."""
     bounds = scenario(name).design.states.bounds
-    return " to ".join(f"{rate:g}" for rate in sorted({one.rate for one in bounds if isinstance(one, Exponential)}))
+    return " to ".join(
+        f"{rate:g}" for rate in sorted({bound.rate for bound in bounds if isinstance(bound, Exponential)})
+    )
 
 
 def comparisons(block: Block, script: Row, local_script: Row) -> Iterator[str]:
-    """What the table says about the questions it was made for; differences are paired by episode and training seed."""
-    by = {(one.variant, one.observe): one for one in block.learned}
+    """Comparisons of observation modes and policies; differences are paired by episode and training seed."""
+    by = {(learned.variant, learned.observe): learned for learned in block.learned}
     estimate, transferred = by["estimate", "estimate"], by["oracle", "estimate"]
     against = _paired("learned on estimates, against learned on the truth", estimate, by["oracle", "oracle"])
     percent = _percent(estimate, by["oracle", "oracle"])
@@ -249,48 +250,50 @@ def comparisons(block: Block, script: Row, local_script: Row) -> Iterator[str]:
         next(row for row in block.scripts.rows if (row.policy, row.observe) == (policy, "estimate"))
         for policy in ("tanh", "linear")
     )
-    for what, returns in (
+    for reference, returns in (
         (f"the best tuned script on estimates ({script.policy})", script.episodes.returns[None]),
         ("the tuned proportional law on estimates (linear)", linear.episodes.returns[None]),
         ("the paper's law on estimates, tuned (tanh)", tanh.episodes.returns[None]),
         (f"the best tuned script on neighbours only ({local_script.policy})", local_script.episodes.returns[None]),
         ("learned on neighbours only", by["local", "local"].returns),
     ):
-        yield f"learned on estimates, against {what}: {_verdict(estimate.returns, returns)}"
+        yield f"learned on estimates, against {reference}: {_verdict(estimate.returns, returns)}"
 
 
 def largest_ratio(block: Block) -> tuple[float, float, float]:
     """Largest |e| over all rows and episodes, after the transient, and largest error over its bound."""
-    rows = [*block.scripts.rows, *(row for one in block.learned for row in one.rows)]
-    seen = [row.episodes for row in rows]
+    rows = [*block.scripts.rows, *(row for learned in block.learned for row in learned.rows)]
+    results = [row.episodes for row in rows]
     return (
-        max(float(one.max_normalized_disagreement.max()) for one in seen),
-        max(float(one.late_normalized_disagreement.max()) for one in seen),
-        max(float(one.max_error_to_bound.max()) for one in seen),
+        max(float(episodes.max_normalized_disagreement.max()) for episodes in results),
+        max(float(episodes.late_normalized_disagreement.max()) for episodes in results),
+        max(float(episodes.max_error_to_bound.max()) for episodes in results),
     )
 
 
 def _line(name: str, returns: FloatArray, rows: Sequence[Row]) -> str:
     mean, interval = returns.mean(), interval95(returns.mean(axis=0))
     spread = f"{returns.mean(axis=1).std(ddof=1):.3g}" if len(returns) > 1 else ""
-    seen = [row.episodes for row in rows]
-    error = np.mean([one.final_task_error.mean() for one in seen])
-    worst = max(float(one.max_normalized_disagreement.max()) for one in seen)
-    late = max(float(one.late_normalized_disagreement.max()) for one in seen)
+    results = [row.episodes for row in rows]
+    error = np.mean([episodes.final_task_error.mean() for episodes in results])
+    worst = max(float(episodes.max_normalized_disagreement.max()) for episodes in results)
+    late = max(float(episodes.late_normalized_disagreement.max()) for episodes in results)
     return f"| {name} | {mean:.4g} ± {interval:.2g} | {spread} | {error:.3g} | {worst:.3f} | {late:.3f} |"
 
 
-def _percent(one: Learned, other: Learned) -> FloatArray:
-    """(seeds,) how much more `one` returns, in percent of the other's absolute return, by training seed."""
-    return 100.0 * (one.returns - other.returns).mean(axis=1) / np.abs(other.returns.mean(axis=1))
+def _percent(learned: Learned, reference: Learned) -> FloatArray:
+    """(seeds,) difference of returns in percent of the reference's absolute return, by training seed."""
+    return 100.0 * (learned.returns - reference.returns).mean(axis=1) / np.abs(reference.returns.mean(axis=1))
 
 
-def _paired(what: str, one: Learned, other: Learned) -> str:
-    """Relative to the other, by training seed."""
-    percent, more = _percent(one, other), (one.returns - other.returns).mean(axis=0)
+def _paired(title: str, learned: Learned, reference: Learned) -> str:
+    """Difference relative to the reference by training seed, and paired by episode."""
+    percent, more = _percent(learned, reference), (learned.returns - reference.returns).mean(axis=0)
     interval = interval95(percent)
     over_seeds = "" if interval is None else f" ± {interval:.2g} % over training seeds"
-    return f"{what}: {percent.mean():+.2g} %{over_seeds}; paired by episode {more.mean():+.3g} ± {interval95(more):.2g}"
+    return (
+        f"{title}: {percent.mean():+.2g} %{over_seeds}; paired by episode {more.mean():+.3g} ± {interval95(more):.2g}"
+    )
 
 
 def _verdict(ours: FloatArray, theirs: FloatArray) -> str:
@@ -318,5 +321,5 @@ def _train(job: tuple[Path, StudyTask, str, int]) -> str:
         training = train(config, folder, resume=(folder / CHECKPOINT).exists())
     if training.finished:
         (folder / DONE).write_text(f"{training.seconds:.1f}")
-    best = max(one.mean_return for one in training.curve)
+    best = max(point.mean_return for point in training.curve)
     return f"{task.label}, {variant}, seed {seed}: {best:.3f} in {training.seconds:.0f} s"

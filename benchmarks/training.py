@@ -1,4 +1,4 @@
-"""How fast policies are trained: PPO's throughput inside `learn`, and the environment's share of it."""
+"""Training speed: PPO's throughput inside `learn`, and the environment's share of the time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.comparison import compare, run_peer
 from benchmarks.report import Report
 
-TURNS = 3  # of the two sides of the ratio
+TURNS = 3  # repetitions of both sides of the ratio
 
 
 def training_rate(timesteps: int) -> tuple[float, float]:
@@ -21,7 +21,7 @@ def training_rate(timesteps: int) -> tuple[float, float]:
 
     Returns:
         Agent-steps per second inside `learn`, and the environment's share of the wall time: stepping, resetting and
-        observing, without what the learner does to rewards and features.
+        observing, without the learner's processing of rewards and features.
     """
     from agents.learning import TrainingConfig
     from agents.learning.environment import training_environment

@@ -1,4 +1,4 @@
-"""What the proximal step is measured against, as well compiled: a bare loop and the explicit step of `paper`."""
+"""Compiled references for the proximal step: a bare loop, and the explicit step of `paper`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from khop_env.simulation.view import displacements
 
 @compiled
 def bare_loop(e: FloatArray, slope: FloatArray, curvature: FloatArray, repeats: int) -> None:
-    """Phi' (with T in it) and phi'' once per element, and nothing else: what any solver has to evaluate."""
+    """Phi' (with T) and phi'' once per element and nothing else: the evaluations that any solver needs."""
     for _ in range(repeats):
         for q in range(e.size):
             transformed = log_ratio(e[q])
@@ -34,7 +34,7 @@ def bare_loop(e: FloatArray, slope: FloatArray, curvature: FloatArray, repeats: 
 def closed_loop_derivative(
     states: Any, inputs: Any, funnels: Any, sines: Any, law: Any, t: FloatArray, z: Any, dz: Any, work: Any
 ) -> None:
-    """Write the rates of x, x_hat and g_hat of `paper` into `dz`, by the compiled pieces that the simulator calls."""
+    """Write the rates of x, x_hat and g_hat of `paper` into `dz`, by the compiled functions of the simulator."""
     x, y, ghat = z
     dx, dy, dghat = dz
     terms, u, e, xi, rho, w = work
@@ -88,7 +88,7 @@ class CompiledPaper:
     """The closed loop of the `paper` scenario without any Python in it.
 
     Args:
-        simulator: built from `paper` with its law; its state is where the loop starts, and isn't changed.
+        simulator: built from `paper` with its law; the loop starts from its state, which isn't changed.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -118,11 +118,11 @@ class CompiledPaper:
         )
 
     def run(self, dt: float, steps: int) -> None:
-        """Take explicit steps."""
+        """Take `steps` explicit steps of `dt` seconds."""
         explicit_steps(*self._constants, self.t, self.z, self._dz, self._work, dt, steps)
 
     def derivative(self, t: float, flat: FloatArray) -> FloatArray:
-        """The right-hand side as SciPy wants it, for a batch of one: all three blocks in one vector."""
+        """The right-hand side for SciPy, with num_envs = 1: all three blocks in one vector."""
         cuts = np.cumsum([block.size for block in self.z])
         blocks = tuple(np.ascontiguousarray(part)[:, None] for part in np.split(flat, cuts[:-1]))
         closed_loop_derivative(*self._constants, np.array([t]), blocks, self._dz, self._work)

@@ -1,4 +1,4 @@
-"""Run a controller on estimates: the same law on estimates, on the truth, and on neighbours only."""
+"""Run a controller on estimates: the same law on estimates, on true states, and on neighbours only."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Write your own agent model and scenario: pendulums that agree on an angle with agents they can't hear."""
+"""Write your own agent model and scenario: pendulums that agree on an angle with k-hop targets."""
 
 import networkx as nx
 import numpy as np
@@ -31,7 +31,7 @@ def swing(model, x, velocity):
 VELOCITY_CONTROLLERS["pendulum"] = swing
 scenario = Scenario(
     name="pendulums",
-    description="six pendulums in a row; each agrees with the one two places on",
+    description="six pendulums in a row; each agrees with its 2-hop targets",
     models=(Pendulum(),) * 6,
     communication=nx.path_graph(6),
     task=nx.Graph([(0, 1), *((i, i + 2) for i in range(4))]),

@@ -7,7 +7,7 @@ from khop_env import leader_following_v0
 
 
 class FollowTheSlot:
-    """Full speed towards where the first slot should be: about the simplest policy that one can write."""
+    """Full speed towards where the first slot should be: about the simplest policy possible."""
 
     def reset(self, env, seeds):
         self.layouts = env.layouts
@@ -23,11 +23,13 @@ class FollowTheSlot:
 
 env = leader_following_v0.batched_env(num_envs=50)
 policies = {name: make_policy(name) for name in ("leader_following", "tanh", "zero")}
-frame = evaluate(env, {"mine": FollowTheSlot(), **policies}, seeds=range(50))
+frame = evaluate(env, {"own": FollowTheSlot(), **policies}, seeds=range(50))
 print(f"leader_following_v0 on {env.scenario}, 50 episodes, on estimates")
 for (name,), rows in frame.group_by("policy", maintain_order=True):
     returns = rows["return"]
     print(f"  {name:17s} return {returns.mean():8.2f}   error at the end {rows['final_task_error'].mean():6.3f} m")
 best = frame.filter(frame["policy"] == "leader_following")["return"]
-more = (frame.filter(frame["policy"] == "mine")["return"] - best).to_numpy()
-print(f"mine against the tuned law, paired: {more.mean():+.2f} +- {1.96 * more.std(ddof=1) / len(more) ** 0.5:.2f}")
+more = (frame.filter(frame["policy"] == "own")["return"] - best).to_numpy()
+print(
+    f"own policy against the tuned law, paired: {more.mean():+.2f} +- {1.96 * more.std(ddof=1) / len(more) ** 0.5:.2f}"
+)

@@ -1,4 +1,4 @@
-"""A task of your own: agents go to goals of their own and keep apart. It works wherever a built-in one does."""
+"""A task of your own: agents go to goals of their own and keep apart. It works everywhere a built-in task does."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from khop_env.tasks import Column, Outcome, Task
 
 @dataclass(eq=False, kw_only=True)
 class KeepApart(Task):
-    """Reward: minus the distance to one's goal, and minus `penalty` while another agent is nearer than `radius`."""
+    """Reward: minus the distance to the own goal, and minus `penalty` while another agent is nearer than `radius`."""
 
     radius: float = 0.5  # m
     penalty: float = 1.0
@@ -27,7 +27,7 @@ class KeepApart(Task):
             self.memory["goal"][..., env] = rng.uniform(-self.arena, self.arena, (len(world.fleet), 2))
 
     def columns(self, world, agent):
-        """Each agent sees where its own goal is, relative to itself: two live columns."""
+        """The position of an agent's own goal, relative to it: two live columns."""
         reach = 2.0 * world.limit
         return [Column(f"goal.{axis}", "m", -reach, reach, row=2 * agent + c) for c, axis in enumerate("xy")]
 
@@ -57,7 +57,7 @@ class GoToGoal:
     """A policy for it: every agent moves towards its goal."""
 
     def reset(self, env, seeds):
-        """Look up where the goal stands in each agent's observation."""
+        """Find the columns of the goal in each agent's observation."""
         self.goal = {agent: layout.columns("goal") for agent, layout in env.layouts.items()}
 
     def act(self, observations):

@@ -25,6 +25,7 @@ from khop_env.commands.scenarios import check, export, list_scenarios
 from khop_env.commands.test import contract
 from khop_env.commands.train import train
 from khop_env.commands.tune import tune
+from khop_env.own_agents import AGENTS, claim_agents
 from khop_env.terminal import say
 
 app = typer.Typer(
@@ -61,9 +62,16 @@ for name, command in COMMANDS.items():
 def main() -> None:
     """Run the command line; where stdout can't be written to, say so in one line, and not at all to a closed pipe."""
     try:
+        if warning := claim_agents():
+            say(f"khop: {warning}")
         app()
     except BrokenPipeError:
         _drop_stdout()
+        raise SystemExit(2) from None
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] != AGENTS:
+            raise
+        say(f"khop: {error}")
         raise SystemExit(2) from None
     except OSError as error:
         _drop_stdout()

@@ -1,8 +1,8 @@
-"""How this package compiles: one decorator, so that all kernels agree on caching, errors and the GIL.
+"""Compilation of kernels: one decorator, with common caching, errors and release of the GIL.
 
-Numba's own cache watches the file of a kernel, not the functions that are pasted into it from other files; a file that
-a crash cut off ends every later run; and on a full disk the call fails. So Numba chooses the folder, and the classes
-below read and write.
+Numba's own cache depends on the file of a kernel, not on functions that are inlined from other files; a truncated cache
+file stops every later run; and on a full disk the call fails. So Numba chooses the folder, and the classes below read
+and write.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# What stands in files whose text kernels depend on; compiled code knows the fields of a named tuple by position only.
+# Marks of files whose text kernels depend on; compiled code knows the fields of a named tuple by position only.
 _MARKS = (b"@compiled", b"@inlined", b"NamedTuple")
 _DIGEST = hashlib.sha256().digest_size
 
@@ -34,14 +34,14 @@ def compiled(function: F) -> F:
     Fast-math stays off: a result may not depend on how many environments share a vector register. Threads are
     Python's own, over ranges of the batch; Numba's pools survive neither forking nor two callers at once.
 
-    Cached code is used while the text of this package's kernels and of the function's own file stays the same. A
-    constant or a kernel that the function takes from yet another file isn't watched.
+    Cached code is used while the text of this package's kernels and of the function's own file stays the same. Changes
+    of constants or kernels that the function takes from other files aren't detected.
     """
     return _cached(function)
 
 
 def inlined(function: F) -> F:
-    """Like `compiled`, but pasted into its compiled callers, so that their loops still vectorise."""
+    """Like `compiled`, but inlined into its compiled callers, so that their loops still vectorise."""
     return _cached(function, inline="always")
 
 
@@ -86,7 +86,7 @@ def _say(text: str) -> None:
 
 
 class _Cache:
-    """What a dispatcher of Numba asks for compiled code, and gives it to. Nothing that goes wrong here is an error.
+    """Cache of compiled code for a dispatcher of Numba. No fault of the cache is an error.
 
     Args:
         function: the kernel.
@@ -104,7 +104,7 @@ class _Cache:
     def load_overload(self, *arguments: Any) -> Any:
         found = None
         if self._numba is not None:
-            with suppress(Exception):  # however a file is damaged
+            with suppress(Exception):  # for any damage of a file
                 found = self._numba.load_overload(*arguments)
         if found is None:
             _announce(kept=self._numba is not None)
@@ -128,8 +128,8 @@ class _Files:
     """Compiled code of one function, a file for each signature and processor: a digest, then the content.
 
     The digest is over all that the content depends on and over the content itself. A file that is cut off, damaged, or
-    of another version of Numba or of the kernels isn't read any further; damaged machine code would end the process.
-    Each file is complete before it gets its name, so that two processes may save at once.
+    of another version of Numba or of the kernels isn't unpickled; damaged machine code would end the process.
+    Each file is complete before it is renamed, so that two processes may save at once.
     """
 
     def __init__(self, folder: Path, function: Callable[..., Any]) -> None:
@@ -140,7 +140,7 @@ class _Files:
         self._stamp = numba.__version__.encode() + _text_of_kernels() + _text_of(source)
 
     def load(self, key: Any) -> Any:
-        """What was saved under `key`, or None."""
+        """The data saved under `key`, or None."""
         try:
             stored = self._path(key).read_bytes()
         except OSError:
@@ -149,7 +149,7 @@ class _Files:
         return pickle.loads(content) if digest == self._digest(key, content) else None
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep `data` under `key`, in the place of what was there."""
+        """Save `data` under `key`, replacing older data."""
         content = pickle.dumps(data, protocol=pickle.HIGHEST_PROTOCOL)
         path = self._path(key)
         unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
@@ -160,7 +160,7 @@ class _Files:
             unfinished.unlink(missing_ok=True)
 
     def flush(self) -> None:
-        """Forget all that was saved."""
+        """Delete all saved data."""
         for path in self._folder.glob(f"{self._name}-*.kernel"):
             path.unlink(missing_ok=True)
 
@@ -175,6 +175,7 @@ class _Files:
 def place(index: int) -> Any:
     """An index that is known not to be negative, for computed indices in inner loops.
 
-    For all the compiler knows `start + q` may be negative and count from the end, and then the loop doesn't vectorise.
+    Otherwise the compiler must assume that `start + q` may be negative and count from the end, and the loop doesn't
+    vectorise.
     """
     return np.uint64(index)

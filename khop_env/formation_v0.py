@@ -16,39 +16,41 @@
 | State Values         | [-100, 100]                                        |
 
 Agents of a team are to stand in a formation, anywhere: to keep the displacement d_ij along every edge (i, j) of a task
-graph. Most of these edges join agents that can't hear each other: an agent hears its neighbours in the communication
-graph, and estimates the states of agents 2 to k hops away, with errors inside bounds that were chosen in advance.
+graph. Most of these edges join agents that aren't neighbours in the communication graph: an agent receives the states
+of its neighbours, and estimates those of its k-hop targets, 2 to k hops away, with errors inside bounds that were
+chosen in advance.
 
 ### Observation Space
 
-An agent observes its own state and a list of slots, one for every other agent within k hops: agents it hears (1 hop)
-and agents whose state it estimates (2 to k hops), ordered by relevance to its task: task edges first, then hop
-distance, then index. With uniform observations the list is padded to the longest; an invalid slot is all zeros.
+An agent observes its own state and a list of slots, one for every other agent within k hops: its neighbours (1 hop),
+whose states it receives, and its k-hop targets (2 to k hops), whose states it estimates. Slots are ordered by relevance
+to its task: task edges first, then hop distance, then index. With uniform observations the list is padded to the
+longest; an invalid slot is all zeros.
 `env.layout(agent)` names every column with its unit, and reads and builds observations.
 
-| Columns                     | What                                                                              |
+| Columns                     | Content                                                                           |
 |-----------------------------|-----------------------------------------------------------------------------------|
 | own.<state>                 | own position, then the other states; an angle as own.<state>.cos and .sin         |
 | own.input.<input>           | own input in force, as a fraction of its limit; not with actuator="direct"        |
 | own.type.<type>             | one-hot of the agent's type; uniform only                                         |
 | slot0.valid                 | 1 if the slot is in use                                                           |
-| slot0.heard                 | 1 if the agent is heard, 0 if it is estimated                                     |
+| slot0.heard                 | 1 if the agent is a neighbour, 0 if it is estimated                               |
 | slot0.hops                  | hop distance in the communication graph                                           |
 | slot0.task_edge             | 1 if this agent's task has an edge to it                                          |
 | slot0.type.<type>           | one-hot of its type; uniform observations of fleets with several types only       |
-| slot0.displacement.x, .y    | where the task wants it, relative to this agent, in m                             |
-| slot0.position.x, .y        | where it is heard or estimated to be, relative to this agent, in m                |
+| slot0.displacement.x, .y    | its desired position, relative to this agent, in m                                |
+| slot0.position.x, .y        | its received or estimated position, relative to this agent, in m                  |
 | slot0.<state>               | its other states; an angle as cosine and sine                                     |
-| slot0.bound.<state>         | the guaranteed bound on the estimate's error, 0 if heard; with `bounds=True` only |
+| slot0.bound.<state>         | guaranteed bound on the estimate's error, 0 for neighbours; `bounds=True` only    |
 | slot1.valid ...             | the next slot                                                                     |
 
-`observe="oracle"` puts the truth and `observe="local"` zeros into the slots of agents that aren't heard; nothing else
-changes, and the spaces stay the same.
+`observe="oracle"` puts true states and `observe="local"` zeros into the slots of k-hop targets; nothing else changes,
+and the spaces stay the same.
 
 ### Action Space
 
-Each agent's inputs as fractions of their limits, in [-1, 1]; what is beyond is clipped and counted in the infos. With
-uniform observations all agents have as many entries as the largest, and ignore those that they have no input for.
+Each agent's inputs as fractions of their limits, in [-1, 1]; larger values are clipped and counted in the infos. With
+uniform observations all agents have as many entries as the largest, and ignore entries without an input.
 
 ### Reward
 
@@ -87,11 +89,11 @@ up to 12 agents, or a square grid
 `scenario`: a name (`khop list`), one with parameters ("random_geometric:agents=12"), a path that ends in .toml, or a
 `Scenario`
 
-`observe`: what slots of agents out of earshot hold: "estimate" (default), "oracle" for the truth, "local" for nothing
+`observe`: content of the slots of k-hop targets: "estimate" (default), "oracle" for true states, "local" for zeros
 
-`bounds`: whether slots hold the guaranteed bound on the estimate's error, too (default False)
+`bounds`: whether slots also hold the guaranteed bound on the estimate's error (default False)
 
-`uniform`: one padded Box for all agents (default), or with False exactly what each agent has
+`uniform`: one padded Box for all agents (default), or with False a Box without padding for each agent
 
 `max_cycles`: control periods in an episode, which is truncated then (default 200)
 
@@ -104,7 +106,7 @@ loop is of order 1 in it anyway; 2 integrates the motion between actions more ac
 
 `actuator`: "direct" (default), "lag", "slew", "hold", or one of `khop_env.env` with parameters, e.g.
 `Lag(time_constant=0.2)`; all but the first keep the derivative of the inputs bounded, as the input observer's theorem
-asks (Assumption 2-ii of the paper)
+requires (Assumption 2-ii of the paper)
 
 `reward`: "agent" (default) for each agent's own, "team" for the mean of all
 
@@ -112,7 +114,7 @@ asks (Assumption 2-ii of the paper)
 
 `success_radius`: terminate the episode when no agent's task error exceeds it, in m (default None: never)
 
-`limit`: bound on positions and other states in observations, in their units (default 100); what is beyond is clipped
+`limit`: bound on positions and other states in observations, in their units (default 100); larger values are clipped
 and counted in the infos
 
 `threads`: of the observers' solve (default 1)
@@ -127,10 +129,11 @@ and counted in the infos
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Unpack
 
-from numpy.typing import ArrayLike
+import numpy as np
 from pettingzoo import AECEnv
 
 from khop_env.env import BatchedEnv, KHopEnv, SettingsArguments
@@ -144,7 +147,7 @@ __all__ = ["batched_env", "env", "parallel_env", "raw_env"]
 class Arguments(EdgeArguments, SettingsArguments, total=False):
     """Keyword arguments of this environment."""
 
-    points: ArrayLike | None
+    points: Sequence[Sequence[float]] | np.ndarray | None
     spacing: float
 
 
@@ -152,7 +155,7 @@ class Arguments(EdgeArguments, SettingsArguments, total=False):
 def batched_env(
     scenario: Scenario | str | Path = "paper", *, num_envs: int = 1, **arguments: Unpack[Arguments]
 ) -> BatchedEnv:
-    """`num_envs` copies as arrays (copies, agents, ...); arguments are described at the top of this module."""
+    """`num_envs` environments as arrays (num_envs, agents, ...); see the top of this module, too."""
     return make_batched(Formation, scenario, num_envs=num_envs, **arguments)
 
 
@@ -160,7 +163,7 @@ def batched_env(
 def parallel_env(
     scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> KHopEnv:
-    """The PettingZoo ParallelEnv; arguments are described at the top of this module."""
+    """The PettingZoo ParallelEnv; see the top of this module, too."""
     return make(Formation, scenario, render_mode=render_mode, **arguments)
 
 
@@ -168,7 +171,7 @@ def parallel_env(
 def env(
     scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None, **arguments: Unpack[Arguments]
 ) -> AECEnv:
-    """The AEC environment, by PettingZoo's own conversion; arguments are described at the top of this module.
+    """The AEC environment, by PettingZoo's own conversion; see the top of this module, too.
 
     `aec.unwrapped.layout(agent)` names the columns of an observation.
     """

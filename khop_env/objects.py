@@ -1,4 +1,4 @@
-"""Python objects by name, as a user writes them where the command line takes one: `my_module:make_env`."""
+"""Load Python objects by name, for the command line: `my_module:make_env`."""
 
 from __future__ import annotations
 
@@ -12,35 +12,38 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from khop_env.own_agents import AGENTS
+
 Result = TypeVar("Result")
 
-_LISTED = 8  # names of a module, in an error
+_LISTED = 8  # names of a module in an error message
 
 
 def load_object(name: str) -> Any:
-    """An attribute of a module or of a file, or the module itself.
+    """Load an attribute of a module or a file, or the module itself.
 
         load_object("my_module:make_env")
         load_object("path/to/my_file.py:Configuration.make")
         load_object("mpe2.simple_spread_v3")
 
-    Modules are looked for among what is installed and in the working directory. A file becomes a module of its own
-    name, and its folder is searched too, so that it can import what lies beside it and its objects can be pickled.
+    Modules are searched for among installed packages and in the working directory. A file is imported as a module with
+    its own name, and its folder is added to the search path, so that it can import files beside it and its objects can
+    be pickled.
 
     Args:
-        name: "module:attribute", "file.py:attribute", or without the attribute.
+        name: "module:attribute" or "file.py:attribute"; the attribute may be omitted.
 
     Raises:
-        ValueError: if there is no such module, file or attribute, or if importing it raises; then with the file and the
-            line that it came from, and with the exception itself as the cause.
+        ValueError: if module, file or attribute doesn't exist, or importing raises; then the message has file and line,
+            and the exception is its cause.
     """
     source, _, attribute = name.rpartition(":")
-    if not source or attribute.endswith(".py") or "/" in attribute or os.sep in attribute:  # a colon of the path's own
+    if not source or attribute.endswith(".py") or "/" in attribute or os.sep in attribute:  # a colon within the path
         source, attribute = name, ""
     found: Any = _file(source) if source.endswith(".py") else _module(source)
     for part in filter(None, attribute.split(".")):
         if not hasattr(found, part):
-            known = [one for one in vars(found) if not one.startswith("_")] if hasattr(found, "__dict__") else []
+            known = [key for key in vars(found) if not key.startswith("_")] if hasattr(found, "__dict__") else []
             listed = ", ".join(known[-_LISTED:]) + (", ..." if len(known) > _LISTED else "")
             owner = source if isinstance(found, ModuleType) else f"{source}: {getattr(found, '__name__', found)}"
             raise ValueError(f"{owner} has no {part!r}; it has {listed or 'no public names'}")
@@ -68,7 +71,7 @@ def called(name: str, function: Callable[..., Result], *arguments: Any, **keywor
 
 
 def is_object_name(name: str) -> bool:
-    """Whether a text is meant for `load_object`: "module:attribute", or a file that ends in .py."""
+    """True if a text has the form of `load_object`: "module:attribute", or a file that ends in .py."""
     source, _, attribute = name.rpartition(":")
     if name.endswith(".py") or source.endswith(".py"):
         return True
@@ -77,11 +80,11 @@ def is_object_name(name: str) -> bool:
 
 
 def described(error: BaseException, file: str = "") -> str:
-    """An exception and where it was raised: "ValueError: no such fleet (my_file.py, line 3, in make_env)".
+    """Describe an exception and where it was raised: "ValueError: no such fleet (my_file.py, line 3, in make_env)".
 
     Args:
         error: the exception.
-        file: how the path of a file ends, whose last line that was under way is named instead of the last of all.
+        file: end of a path; the innermost line in that file is named instead of the innermost of all.
     """
     text = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError) and error.filename is not None:
@@ -94,7 +97,7 @@ def described(error: BaseException, file: str = "") -> str:
 
 
 def _short(filename: str) -> str:
-    """A path as seen from the working directory, or from where packages are installed."""
+    """A path relative to the working directory or to the folder of installed packages."""
     path = Path(filename)
     for folder in (*(parent for parent in path.parents if parent.name == "site-packages"), Path.cwd()):
         if path.is_relative_to(folder):
@@ -103,14 +106,16 @@ def _short(filename: str) -> str:
 
 
 def _module(name: str) -> ModuleType:
-    """An installed module, or one in the working directory."""
+    """Import an installed module, or a module in the working directory."""
     if not all(part.isidentifier() for part in name.split(".")):
-        raise ValueError(f"{name!r} names no Python object: write my_module:name or my_file.py:name")
+        raise ValueError(f"{name!r} isn't the name of a Python object; expected my_module:name or my_file.py:name")
     _search(Path.cwd())
     try:
         return importlib.import_module(name)
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+            if name.partition(".")[0] == AGENTS:  # it says what to do
+                raise ValueError(str(error)) from None
             raise ValueError(
                 f"no module {error.name!r}, neither installed nor in the working directory; a file's name ends in .py"
             ) from None
@@ -118,10 +123,10 @@ def _module(name: str) -> ModuleType:
 
 
 def _file(text: str) -> ModuleType:
-    """A file as a module."""
+    """Import a file as a module."""
     path = Path(text).resolve()
     if not path.is_file():
-        raise ValueError(f"no file {text!r} (seen from {Path.cwd()})")
+        raise ValueError(f"no file {text!r} (relative to {Path.cwd()})")
     known = sys.modules.get(path.stem)
     if known is not None:
         if Path(getattr(known, "__file__", None) or "").resolve() == path:
@@ -142,7 +147,7 @@ def _file(text: str) -> ModuleType:
 
 
 def _search(folder: Path) -> None:
-    """Let imports find what lies in a folder, after everything that is installed."""
+    """Append a folder to the search path of imports."""
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
 

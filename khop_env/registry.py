@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
@@ -11,9 +12,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-import khop_env.tasks
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
+from khop_env.extras import how_to_install
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.observers import Proximal
 from khop_env.physics import did_you_mean
@@ -29,12 +30,31 @@ if TYPE_CHECKING:
 
     from khop_env.env.sb3 import KHopSB3VecEnv
 
+__all__ = [
+    "SCENARIOS",
+    "Environment",
+    "ScenarioFactory",
+    "describe",
+    "environments",
+    "find_task",
+    "make",
+    "make_aec",
+    "make_batched",
+    "make_joint",
+    "make_sb3_vec",
+    "make_vec",
+    "parameters_from_text",
+    "scenario",
+    "scenarios",
+    "spelled_out",
+]
+
 ScenarioFactory = Callable[..., Scenario]
 """A function that makes a scenario; the parameters of a family are int, float, bool or str, with defaults."""
 
 Environment: TypeAlias = str | Task | type[Task]
-"""An environment's name, or a task: an object, or a class that is made with the task's arguments; or where such an
-object or class is found, "my_module:MyTask" or "my_file.py:MyTask"."""
+"""An environment's name, or a task: an object, or a class that is constructed with the task's arguments; or the
+place of such an object or class, "my_module:MyTask" or "my_file.py:MyTask"."""
 
 SCENARIOS: dict[str, ScenarioFactory] = {
     factory.__name__: factory for factory in (paper, convoy, mixed_fleet, random_geometric)
@@ -57,19 +77,19 @@ def environments() -> tuple[str, ...]:
 
 
 def find_task(environment: Environment) -> Task | type[Task]:
-    """The task that an environment plays: an object, or a class that is still to be given its arguments.
+    """The task of an environment: an object, or a class to be constructed with arguments.
 
     Args:
-        environment: one of `environments()`, a task of your own, or where it is found, "my_file.py:MyTask".
+        environment: one of `environments()`, a task of your own, or its place, "my_file.py:MyTask".
 
     Raises:
-        TypeError: for something else.
-        ValueError: for an unknown environment, with the closest name, or a name under which something else is found.
+        TypeError: if `environment` is neither a name nor a task.
+        ValueError: for an unknown environment, with the closest name, or a name that stands for something else.
     """
     found: Any = environment
     if isinstance(environment, str):
         if environment in ENVIRONMENTS:
-            found = getattr(khop_env.tasks, ENVIRONMENTS[environment])
+            found = load_object(ENVIRONMENTS[environment])
         elif is_object_name(environment):
             found = load_object(environment)
         else:
@@ -84,12 +104,12 @@ def find_task(environment: Environment) -> Task | type[Task]:
 def make_batched(
     environment: Environment, scenario: Scenario | str | Path | None = None, *, num_envs: int = 1, **arguments: Any
 ) -> BatchedEnv:
-    """Copies of an environment as arrays (copies, agents, ...).
+    """A batch of environments as arrays (num_envs, agents, ...).
 
     Args:
         environment: one of `environments()`, or a task of your own.
-        scenario: a scenario, or what `scenario` takes; the task's default if left out.
-        num_envs: copies B.
+        scenario: a scenario, or an argument of `scenario`; the task's default if left out.
+        num_envs: number of environments B.
         arguments: of `Settings`, and of the task unless it is an object, by name.
 
     Raises:
@@ -100,7 +120,7 @@ def make_batched(
     if "render_mode" in arguments:
         raise TypeError(
             "got an unexpected keyword argument 'render_mode': batches aren't rendered; give it to the environment's "
-            "parallel_env, which is one copy"
+            "parallel_env, which is one environment"
         )
     of_settings = [field.name for field in dataclasses.fields(Settings)]
     of_task = list(_task_parameters(task)) if isinstance(task, type) else []
@@ -129,7 +149,7 @@ def make(
 
     Args:
         environment: one of `environments()`, or a task of your own.
-        scenario: a scenario, or what `scenario` takes; the task's default if left out.
+        scenario: a scenario, or an argument of `scenario`; the task's default if left out.
         render_mode: None, "human" or "rgb_array".
         arguments: as for `make_batched`.
 
@@ -172,7 +192,7 @@ def make_vec(
 
     Args:
         environment: one of `environments()`, or a task of your own.
-        num_envs: copies B; with N agents the vector environment has B * N rows.
+        num_envs: number of environments B; with N agents the vector environment has B * N rows.
         autoreset_mode: "same_step" (default), "next_step" or "disabled", as `KHopVectorEnv` describes them.
         arguments: those of `make`, without render_mode.
 
@@ -185,11 +205,11 @@ def make_vec(
 
 
 def make_sb3_vec(environment: Environment, num_envs: int = 1, **arguments: Any) -> KHopSB3VecEnv:
-    """A Stable-Baselines3 VecEnv over the batched simulator, one sub-environment per agent and copy.
+    """A Stable-Baselines3 VecEnv over the batched simulator, one row per agent and environment.
 
     Args:
         environment: one of `environments()`, or a task of your own.
-        num_envs: copies B.
+        num_envs: number of environments B.
         arguments: as for `make_vec`.
 
     Raises:
@@ -200,12 +220,12 @@ def make_sb3_vec(environment: Environment, num_envs: int = 1, **arguments: Any) 
     try:
         from khop_env.env.sb3 import KHopSB3VecEnv
     except ImportError as error:
-        raise ImportError("make_sb3_vec needs Stable-Baselines3: pip install 'khop_env[rl]'") from error
+        raise ImportError(f"make_sb3_vec needs Stable-Baselines3: {how_to_install('rl')}") from error
     return KHopSB3VecEnv(make_batched(environment, num_envs=num_envs, **arguments))
 
 
 def make_joint(environment: Environment, render_mode: str | None = None, **arguments: Any) -> JointEnv:
-    """The centralised single-agent view, which `gymnasium.make("khop/Consensus-v0")` gives.
+    """The centralised single-agent environment, which `gymnasium.make("khop/Consensus-v0")` returns.
 
     Args:
         environment: one of `environments()`, or a task of your own.
@@ -223,24 +243,51 @@ make_joint.metadata = JointEnv.metadata  # type: ignore[attr-defined]  # where g
 
 
 def spelled_out(task: type[Task]) -> Callable[[Function], Function]:
-    """Show the arguments of settings and task in the signature of a function that takes them as keywords.
+    """Show the arguments of settings and task in signature and docstring of a function that takes them as keywords.
 
     Args:
         task: the environment's.
     """
 
     def decorate(function: Function) -> Function:
-        signature = inspect.signature(function)
-        fixed = [each for each in signature.parameters.values() if each.kind is not inspect.Parameter.VAR_KEYWORD]
+        signature, own = inspect.signature(function), get_type_hints(function)
+        fixed = [
+            each.replace(annotation=own[each.name])
+            for each in signature.parameters.values()
+            if each.kind is not inspect.Parameter.VAR_KEYWORD
+        ]
         hints = get_type_hints(Settings) | get_type_hints(task)
         keywords = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
             for name, default in {**_task_parameters(task), **_defaults(Settings)}.items()
         ]
-        function.__signature__ = signature.replace(parameters=[*fixed, *keywords])  # type: ignore[attr-defined]
+        shown = signature.replace(parameters=[*fixed, *keywords], return_annotation=own["return"])
+        function.__signature__ = shown  # type: ignore[attr-defined]
+        if function.__doc__:  # there are none under python -OO
+            texts = _SHARED_ARGUMENTS | _attributes(Settings) | _attributes(task)
+            lines = [f"    {each}\n        {texts[each.name]}" for each in shown.parameters.values()]
+            function.__doc__ = inspect.cleandoc(function.__doc__) + "\n\nArgs:\n" + "\n".join(lines)
         return function
 
     return decorate
+
+
+_SHARED_ARGUMENTS = {
+    "scenario": "a name, a name with parameters, a path that ends in .toml, or a `Scenario`.",
+    "num_envs": "copies B.",
+    "render_mode": 'None, "human" or "rgb_array".',
+}
+
+
+def _attributes(cls: type) -> dict[str, str]:
+    """What the docstrings of a dataclass and its bases say of each attribute, with the line breaks of theirs."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        section = inspect.cleandoc(vars(base).get("__doc__") or "").partition("\nAttributes:\n")[2].partition("\n\n")[0]
+        for text in re.split(r"^    (?=\w)", section, flags=re.MULTILINE)[1:]:
+            name, _, words = text.partition(": ")
+            found[name] = words.strip()
+    return found
 
 
 def _task_parameters(task: type[Task]) -> dict[str, Any]:
@@ -281,13 +328,13 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
         scenario("my_file.py:scenario")
 
     Args:
-        name_or_path: a registered name, parameters of a family after a colon, a path that ends in .toml, or where a
-            `Scenario`, or a function that returns one, is found.
-        parameters: parameters of a family; they win over those after the colon.
+        name_or_path: a registered name, parameters of a family after a colon, a path that ends in .toml, or the place
+            of a `Scenario` or of a function that returns one.
+        parameters: parameters of a family; they override those after the colon.
 
     Raises:
         ScenarioFileError: if the file is wrong.
-        ValueError: for an unknown name or parameter, naming the nearest.
+        ValueError: for an unknown name or parameter; the message suggests the closest one.
     """
     text = str(name_or_path)
     if text.endswith(".toml"):
@@ -296,7 +343,7 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
         if parameters:
             raise ValueError(f"a scenario file takes no parameters; got {', '.join(parameters)} with {text}")
         return read_scenario(text)
-    name, _, given = text.partition(":")
+    name, _, settings = text.partition(":")
     if name not in SCENARIOS and is_object_name(text):
         found = load_object(text)
         made = called(text, found, **parameters) if callable(found) else found
@@ -312,7 +359,7 @@ def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:
         raise ValueError(f"no scenario {name!r}; {did_you_mean(name, SCENARIOS)} (A file's name ends in .toml.)")
     factory = SCENARIOS[name]
     known = inspect.signature(factory).parameters
-    parameters = parameters_from_text(given, get_type_hints(factory), f"scenario {text!r}") | parameters
+    parameters = parameters_from_text(settings, get_type_hints(factory), f"scenario {text!r}") | parameters
     for key in parameters:
         if key not in known:
             what = did_you_mean(key, known) if known else "it has none"
@@ -324,12 +371,12 @@ def parameters_from_text(text: str, types: Mapping[str, Any], what: str) -> dict
     """Parameters of "agents=100,k=2": numbers, true or false, or text, as their types ask.
 
     Args:
-        text: what stands after the colon of a name; may be empty.
-        types: of the known parameters; others stay text, to be refused by name.
-        what: they are parameters of, for the error.
+        text: the part of a name after its colon; may be empty.
+        types: of the known parameters; others stay text, and are refused by name later.
+        what: the owner of the parameters, for the error.
 
     Raises:
-        ValueError: for what isn't parameter=value, or isn't of its type.
+        ValueError: for text that isn't parameter=value, or a value of another type.
     """
     found = {}
     for part in filter(None, text.split(",")):

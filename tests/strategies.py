@@ -1,4 +1,4 @@
-"""What the tests draw: connected graphs, mixed fleets, funnels that their initial set fits into, and whole systems.
+"""Random test cases: connected graphs, mixed fleets, funnels that their initial set fits into, and whole systems.
 
 The paper's definitions are written out here once more, from the graph alone (networkx), for tests to compare with.
 """

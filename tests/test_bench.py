@@ -68,7 +68,7 @@ def test_every_promised_figure_is_printed():
 
 
 def test_ratios_to_peers(tmp_path, monkeypatch):
-    """To those that are installed: ours over theirs, and what is compared stands beside it."""
+    """To installed peers: our rate over the peer's, with the compared cases in the row."""
     asked = []
 
     def peer_rate(python, peer, batch, threads, seconds):
@@ -127,7 +127,7 @@ def test_a_peer_that_fails_costs_its_ratio_only(tmp_path):
 
 @pytest.fixture
 def quick_parts(monkeypatch):
-    """The parts that need no more than the core, each a row."""
+    """Parts that need the core only, with a row each."""
     for index, name in enumerate(("_against_explicit", "_growth")):
         monkeypatch.setattr(module, name, lambda add, *rest, index=index: add(f"row {index}", 1.0))
     monkeypatch.setattr(module, "_ratio_to_floor", lambda quick: 2.0)
@@ -148,7 +148,7 @@ def test_without_the_extras_the_rest_is_measured(quick_parts, monkeypatch):
     monkeypatch.setattr(sys, "meta_path", [NotInstalled(), *sys.meta_path])
     lines = []
     report = benchmark(quick=True, progress=lines.append)
-    how = "pip install -c constraints.txt -e '.[bench]'"
+    how = "in a clone of khop_env, pip install -c constraints.txt -e '.[bench]'"
     assert lines[:3] == [
         f"left out: proximal against SciPy's stiff solvers (needs scipy: {how})",
         f"left out: training: PPO, 64 environments of 8 agents (needs stable_baselines3 and torch: {how})",

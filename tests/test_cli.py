@@ -259,12 +259,12 @@ class TestRun:
         assert len(list((folder / "out").iterdir())) == 4
 
     def test_films_that_could_not_be_made_are_refused_before_anything_is_computed(self, folder, monkeypatch):
-        assert "ends in .mp4 or .gif" in refused("run", "paper", "--video", "film.avi")
+        assert "must end in .mp4 or .gif" in refused("run", "paper", "--video", "film.avi")
         assert "did you mean 'drifter_" in refused("run", "paper", "--video", "film.gif", "--observer", "driftr_1")
         assert "no agent 8" in refused("run", "paper", "--video", "film.gif", "--observer", "8")
         assert "give --video FILE, too" in refused("run", "paper", "--observer", "1")
         monkeypatch.setitem(sys.modules, "pygame", None)
-        assert "pip install 'khop_env[render]'" in refused("run", "paper", "--video", "film.gif")
+        assert "pip install -c constraints.txt -e '.[render]'" in refused("run", "paper", "--video", "film.gif")
         assert not list(folder.iterdir())
 
     def test_a_file_that_cannot_be_written_is_told_after_the_summary(self, folder):

@@ -65,7 +65,7 @@ def test_evaluate_prints_csv():
         (("consensus_v0", "--policies", "zero,zero"), "--policies names 'zero' twice"),
         (("consensus_v0", "--observe", "truth"), "observe must be one of estimate, oracle, local; got 'truth'"),
         (("consensus_v0", "--csv", "--json"), "choose one of them"),
-        (("consensus_v0", "--observe", ","), "name at least one policy and one observation mode"),
+        (("consensus_v0", "--observe", ","), "expected at least one policy and one observation mode"),
         (("consensus_v0", "--figure", "errors"), "--figure errors: a figure's name ends in .png, .pdf or .svg"),
     ],
 )

@@ -61,7 +61,7 @@ def test_a_failed_check_is_the_exit_status(folder):
         (("consensus_v0", "--scenario", "papr"), "no scenario 'papr'; did you mean 'paper'?"),
         (("my_env:parallel_env", "--scenario", "paper"), "--scenario is for environments that khop list names"),
         (("my_env:failing",), "my_env:failing raised RuntimeError: no such fleet (my_env.py, line 14, in failing)"),
-        (("my_env:walkers",), "expected a PettingZoo ParallelEnv, or a function that makes one; got module"),
+        (("my_env:walkers",), "expected a PettingZoo ParallelEnv, or a function that returns one; got module"),
         (("my_env:broken", "--skip", "spaecs"), "no check 'spaecs'; did you mean 'spaces'?"),
         (("my_env.py:parallel", "--json"), "my_env.py has no 'parallel'; it has "),
     ],

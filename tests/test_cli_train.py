@@ -38,7 +38,7 @@ def test_the_file_that_a_run_writes_repeats_it(folder):
     options = ("--config", "tiny.toml", "--env", "control_period=0.1", "--env", "reward=team", "--env", "dt=none")
     first = only_json(khop("train", "consensus_v0", "--scenario", "mine.toml", *options, "--out", "a", "--json"))
     text = (folder / "a" / "config.toml").read_text()
-    assert "# copies of the environment, each of N agents.\nnum_envs = 2\n" in text
+    assert "# number of environments, each with N agents.\nnum_envs = 2\n" in text
     assert "in its unit" in text  # of the task error
     values = tomllib.loads(text)
     assert set(first["config"]) == set(values)
@@ -73,7 +73,7 @@ def test_arguments_reach_checks_and_runs(folder):
     assert "--env control_period=0.1 --policies ppo:out" in khop("train", "consensus_v0", *options).stdout
     assert LearnedPolicy.load(folder / "out").about["arguments"] == {"control_period": 0.1}
     said = refused("evaluate", "consensus_v0", "--policies", "ppo:out", "--episodes", "1")
-    assert "it was trained to act every 0.1 s, here agents act every 0.05 s" in said
+    assert "it was trained with a control period of 0.1 s; this environment has 0.05 s" in said
     arguments = ("--policies", "ppo:out", "--episodes", "1", "--observe", "estimate", "--env", "control_period=0.1")
     played = only_json(khop("evaluate", "consensus_v0", *arguments, "--json"))
     for name in ("consensus_v0", "paper"):

@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def found() -> bool:
-    """Whether `kernel`, decorated anew as a new process does, is read from the cache; its result is right anyway."""
+    """True if `kernel`, decorated anew as a new process does, is read from the cache; its result is right anyway."""
     function = compiled(kernel)
     assert function(1.0) == 2.0
     return sum(function.stats.cache_hits.values()) == 1

@@ -22,7 +22,7 @@ PACKAGES = ["agents", "khop_env"] + [
 
 
 def public_names() -> dict[str, object]:
-    """What each package lists in __all__, classes and functions only: aliases and tables can't have a docstring."""
+    """Names in __all__ of each package, classes and functions only: aliases and tables can't have a docstring."""
     found = {}
     for name in PACKAGES:
         package = importlib.import_module(name)
@@ -53,7 +53,7 @@ def documentation(cls: type) -> str:
 
 
 def mentions(text: str, argument: str) -> bool:
-    """Whether a docstring has the argument's name as a word."""
+    """True if a docstring has the argument's name as a word."""
     return re.search(rf"(?<![\w.]){re.escape(argument)}(?!\w)", text) is not None
 
 

@@ -13,7 +13,14 @@ ON_DEMAND = ("khop_env.commands.bench", "benchmarks.benchmark")  # the one that 
 
 # One line a rank; nothing imports from a later line. A new module has to be put in its place here.
 RANKS = [
-    ["khop_env.compiled", "khop_env.catalog", "khop_env.objects"],
+    [
+        "khop_env.compiled",
+        "khop_env.catalog",
+        "khop_env.brief",
+        "khop_env.extras",
+        "khop_env.own_agents",
+        "khop_env.objects",
+    ],
     ["khop_env.elementary"],
     ["khop_env.physics"],
     ["khop_env.observers"],

@@ -1,4 +1,4 @@
-"""Python objects by name: what is found, and what is said where nothing is."""
+"""Python objects by name: loading, and messages if that fails."""
 
 import inspect
 import os
@@ -12,7 +12,7 @@ from khop_env.objects import described, load_object
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A working directory with files of a user's, whose modules are forgotten afterwards."""
+    """A working directory with files of a user, whose modules are unloaded afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     known = set(sys.modules)
@@ -54,12 +54,12 @@ def test_of_modules_and_of_files_in_the_working_directory_and_elsewhere(folder):
             "no module 'my_thing', neither installed nor in the working directory; a file's name ends in .py",
         ),
         ("json.no_such:value", "no module 'json.no_such', neither"),
-        ("my_thing.py:value", "no file 'my_thing.py' .seen from "),
+        ("my_thing.py:value", "no file 'my_thing.py' .relative to "),
         ("my_things:valeu", "my_things has no 'valeu'; it has LENGTH, Part, value"),
         ("my_things.py:Part.build", "my_things.py: Part has no 'build'; it has make"),
         ("paper:", "'paper:' names no Python object|no module 'paper'"),
-        ("a b:c", "'a b' names no Python object: write my_module:name or my_file.py:name"),
-        ("", "'' names no Python object"),
+        ("a b:c", "'a b' isn't the name of a Python object; expected my_module:name or my_file.py:name"),
+        ("", "'' isn't the name of a Python object"),
         ("broken:x", r"importing broken raised JSONDecodeError: Expecting .* \(broken.py, line 3, in <module>\)"),
         ("broken.py:x", r"importing broken.py raised JSONDecodeError: Expecting .* \(broken.py, line 3, in <module>\)"),
         ("misspelt.py:x", r"raised SyntaxError: invalid syntax.* \(misspelt.py, line 2\)"),

@@ -89,7 +89,7 @@ def test_a_missing_file():
 
 @pytest.mark.parametrize("make", [make_vec, make_sb3_vec])
 def test_batches(make):
-    """What is misspelt, and what only one copy has."""
+    """Misspelt arguments, and render modes of batches."""
     with pytest.raises(TypeError, match="got an unexpected keyword argument 'num_env'; did you mean 'num_envs'"):
         make("consensus_v0", num_env=3)
     with pytest.raises(TypeError, match="unexpected keyword argument 'render_mode': batches aren't rendered"):

@@ -1,4 +1,4 @@
-"""check_environment: what keeps the contract passes, and each way to break it is caught by one check and named."""
+"""check_environment: correct environments pass, and each violation fails exactly one check, with its place."""
 
 import copy
 import re
@@ -24,7 +24,7 @@ def statuses(report: Report, status: str) -> list[str]:
 
 
 def test_what_keeps_the_contract_passes():
-    """All checks of a ParallelEnv, without a note; those of our own environments say why they don't apply."""
+    """All checks of a ParallelEnv pass without notes; those for our own environments say why they don't apply."""
     report = check_environment(Walkers)
     assert report.ok
     assert tuple(check.name for check in report.checks) == CHECKS
@@ -69,7 +69,7 @@ def test_flags_that_are_no_flags():
 
 
 def test_noise_is_found_although_buffers_are_written_again():
-    """Comparisons are of what was returned, not of what stands there at the end."""
+    """Comparisons use the values at the time of return, not at the end."""
 
     class NoisyStart(Buffered):
         def observe_all(self):
@@ -105,7 +105,7 @@ def test_instances_that_share_a_generator():
 
 
 def test_an_object_is_copied_and_one_that_cannot_be_says_so():
-    """The object itself isn't touched where it can be copied; otherwise checks that need several are skipped."""
+    """An object that can be copied isn't changed; otherwise checks that need several environments are skipped."""
     env = Walkers()
     assert check_environment(env).ok
     assert env.agents == []
@@ -119,7 +119,10 @@ def test_an_object_is_copied_and_one_that_cannot_be_says_so():
     needed = {"unseeded", "pettingzoo_seeds"}
     assert needed <= set(statuses(report, "skipped"))
     for name in needed:
-        assert "give a function that makes one: deepcopy raised TypeError: I hold a window (" in report[name].detail
+        assert (
+            "pass a function that returns a new one: deepcopy raised TypeError: I hold a window ("
+            in report[name].detail
+        )
     assert "same_seed" in statuses(report, "passed")  # which plays the object twice
     assert check_environment(Siamese())["deepcopy"].status == "failed"
 
@@ -134,12 +137,12 @@ def test_checks_that_are_left_out_and_episodes_that_do_not_end():
 @pytest.mark.parametrize(
     ("env", "arguments", "message"),
     [
-        (3, {}, r"expected a PettingZoo ParallelEnv, or a function that makes one; got int"),
+        (3, {}, r"expected a PettingZoo ParallelEnv, or a function that returns one; got int"),
         (lambda: None, {}, r"got NoneType"),
         (parallel_to_aec(Walkers()), {"skip": ["spaecs"]}, r"no check 'spaecs'; did you mean 'spaces'"),
-        (lambda: ONLY, {}, "the function returned one environment twice"),
-        (Walkers, {"steps": 0}, "steps must be at least 1 and seed not negative; got 0 and 0"),
-        (Walkers, {"seed": -1}, "got 300 and -1"),
+        (lambda: ONLY, {}, "the function returned the same environment twice"),
+        (Walkers, {"steps": 0}, "steps must be at least 1 and seed not negative; got steps=0 and seed=0"),
+        (Walkers, {"seed": -1}, "got steps=300 and seed=-1"),
     ],
 )
 def test_what_it_refuses(env, arguments, message):
@@ -170,7 +173,7 @@ def test_the_other_views_are_checked_as_the_environment_inside(make):
 
 
 class Generous(KHopEnv):
-    """Rewards that batches don't know of."""
+    """Rewards that differ from those of the batched form."""
 
     def step(self, actions):
         observations, rewards, *others = super().step(actions)
@@ -207,7 +210,7 @@ def test_each_view_is_held_against_single_environments(view, method, text, monke
 
 
 def observing(part):
-    """BatchedEnv._observe with a little of what agents can't know in everybody's first column."""
+    """BatchedEnv._observe with inaccessible information added to every agent's first column."""
     original = BatchedEnv._observe
 
     def observe(self):
@@ -223,10 +226,10 @@ def observing(part):
     [
         (
             lambda env: env.simulator.x[:, -1],
-            r"the true state of 'drifter_7' shows in the observation of 'drifter_\d', ",
+            r"the true state of 'drifter_7' changes the observation of 'drifter_\d', ",
         ),
-        (lambda env: env.simulator.estimates[:, 0], r"an estimate that '.*' makes shows in the observation of "),
-        (lambda env: env.simulator.u[:, 0], r"the simulator's u shows in the observation of '.*allowed: nobody"),
+        (lambda env: env.simulator.estimates[:, 0], r"an estimate that '.*' makes changes the observation of "),
+        (lambda env: env.simulator.u[:, 0], r"the simulator's u changes the observation of '.*allowed: none"),
     ],
     ids=["state", "estimate", "input"],
 )
@@ -272,7 +275,7 @@ def test_without_sb3_its_check_says_how_to_install_it(monkeypatch):
     report = check_environment(partial(consensus_v0.parallel_env, "paper", max_cycles=10), steps=20)
     assert report.ok
     assert report["sb3"].status == "skipped"
-    assert "pip install 'khop_env[rl]'" in report["sb3"].detail
+    assert "pip install -c constraints.txt -e '.[rl]'" in report["sb3"].detail
     assert report["views"].detail == "not compared as an SB3 VecEnv: Stable-Baselines3 isn't installed"
 
 
@@ -281,7 +284,7 @@ def test_ragged_observations_have_fewer_views():
         partial(consensus_v0.parallel_env, "mixed_fleet", uniform=False, max_cycles=10), steps=20
     )
     assert statuses(report, "passed") == list(CHECKS), str(report)
-    assert report["views"].detail.startswith("ragged observations have no rows")
+    assert report["views"].detail.startswith("ragged observations have no vector form")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A small environment that keeps the contract, and others of which each breaks it in one way."""
+"""A small environment that fulfils the contract, and variants that each violate it in one way."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ HORIZON = 12
 
 
 class Walkers(ParallelEnv):
-    """Two walkers on a line, pushed and shaken; each sees where it is and how far away the other is."""
+    """Two walkers on a line with noise; each observes its own position and the distance to the other."""
 
     metadata = {"name": "walkers", "is_parallelizable": True, "render_modes": []}  # noqa: RUF012
     decay = 0.9
@@ -81,7 +81,7 @@ class Walkers(ParallelEnv):
 
 
 class Drifting(Walkers):
-    """Leaves its Box, but only if it is pushed one way for a long time."""
+    """Leaves its Box, but only under constant actions over a long time."""
 
     decay = 1.0
 
@@ -92,7 +92,7 @@ class Drifting(Walkers):
 
 
 class DriftingState(Walkers):
-    """state() leaves its Box, likewise."""
+    """state() leaves its Box under the same condition."""
 
     decay = 1.0
 
@@ -116,7 +116,7 @@ class Shaken(Walkers):
 
 
 class Globally(Walkers):
-    """Moves NumPy's generator for nothing."""
+    """Advances NumPy's global generator without need."""
 
     def noise(self):
         np.random.random()  # noqa: NPY002
@@ -129,7 +129,7 @@ class DeafToSeeds(Walkers):
 
 
 class BornSeeded(Walkers):
-    """Draws from a generator made in the constructor until it is seeded."""
+    """Draws from a generator created in the constructor until it is seeded."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class OneArray(Walkers):
 
 
 class Lent(Walkers):
-    """Hands out what it computes with."""
+    """Returns its internal array."""
 
     def state(self):
         return self.x
@@ -170,7 +170,7 @@ class Lent(Walkers):
 
 
 class KeepsActions(Walkers):
-    """Computes with the last action's own array a step later."""
+    """Uses the previous action's own array one step later."""
 
     def reset(self, seed=None, options=None):
         self.last = {agent: np.zeros(1, np.float32) for agent in self.possible_agents}
@@ -184,7 +184,7 @@ class KeepsActions(Walkers):
 
 
 class Forgetful(Walkers):
-    """A pickled copy starts from nothing, like what is made by its constructor's arguments alone."""
+    """A pickled copy is built from the constructor's arguments alone, without state."""
 
     def __reduce__(self):
         return type(self), ()
@@ -244,7 +244,7 @@ class LikeMpe2(Walkers):
         return seen
 
 
-COPIED = r"copied after 4 steps, the original and its copy play different ones: call 0"
+COPIED = r"copied after 4 steps, original and copy differ: call 0"
 FAULTS = {
     Drifting: ("spaces", r"call \d+, step\(\), all actions at their lower bound: the observation of 'walker_"),
     DriftingState: (
@@ -256,10 +256,10 @@ FAULTS = {
     Globally: ("global_random", r"call 1, step\(\) moves NumPy's global generator"),
     DeafToSeeds: ("other_seed", r"seeds 0 and 1 give the same 20 steps"),
     BornSeeded: ("unseeded", r"two environments that were never seeded play the same 20 steps"),
-    Buffered: ("memory", r"what call 0, reset\(\) returned is written again later: returned\['observations'\]"),
+    Buffered: ("memory", r"the return value of call 0, reset\(\) is written to later: returned\['observations'\]"),
     OneArray: ("memory", r"call 0, reset\(\): the observations of 'walker_0' and 'walker_1' share memory"),
-    Lent: ("memory", r"state\(\), asked the first time and state\(\), asked the second time return the same memory"),
-    KeepsActions: ("memory", r"writing into what was returned, or into actions, changes what follows: call 2"),
+    Lent: ("memory", r"state\(\), first call and state\(\), second call return the same memory"),
+    KeepsActions: ("memory", r"writing into returned values or actions changes later steps: call 2"),
     Forgetful: ("pickle", COPIED),
     Siamese: ("deepcopy", COPIED),
     Terminating: ("episode_end", r"3 episodes of different seeds and actions all end after 12 steps, by termination"),
@@ -267,4 +267,4 @@ FAULTS = {
     SwallowsNan: ("nan_action", r"nan in the action of 'walker_0' isn't refused: the observation of 'walker_0' isn't"),
     NewSpaces: ("pettingzoo", r"AssertionError: observation_space should return the exact same space object"),
 }
-"""The check that catches each, and what it says; no other check fails."""
+"""The only check that fails for each, and its message."""

@@ -1,4 +1,4 @@
-"""Learning: policies trained on estimated observations, and how they act afterwards."""
+"""Learning: training of policies on estimates, and the trained policies."""
 
 from agents.learning.config import ALGORITHMS, TrainingConfig
 from agents.learning.learned import PRETRAINED, LearnedPolicy, PretrainedPolicy, pretrained_name

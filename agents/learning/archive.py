@@ -1,4 +1,4 @@
-"""Arrays in .npz files that may come from anybody: sizes are checked first, and nothing is unpickled."""
+"""Arrays in .npz files from untrusted sources: sizes are checked first, and nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 class ArchiveError(ValueError):
-    """A file that isn't an archive of plain arrays, or is larger than it may be; the message says why."""
+    """The file isn't an archive of plain arrays, or is too large; the message says why."""
 
 
 def read_arrays(path: Path, most_bytes: int) -> dict[str, np.ndarray]:
@@ -24,10 +24,10 @@ def read_arrays(path: Path, most_bytes: int) -> dict[str, np.ndarray]:
 
     Args:
         path: the file.
-        most_bytes: the size that its arrays may have together, as the file declares it.
+        most_bytes: limit on the total size of the arrays in bytes, as declared by the file.
 
     Raises:
-        ArchiveError: for whatever is wrong with the file.
+        ArchiveError: if the file can't be read for any reason.
     """
     try:
         if not path.is_file():
@@ -36,25 +36,28 @@ def read_arrays(path: Path, most_bytes: int) -> dict[str, np.ndarray]:
             raise ArchiveError("it is empty")
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
-            declared, names = sum(one.file_size for one in members), {one.filename for one in members}
+            declared, names = sum(member.file_size for member in members), {member.filename for member in members}
             if declared > most_bytes:
-                raise ArchiveError(f"unpacked it would have {declared:,} bytes, and at most {most_bytes:,} are read")
+                raise ArchiveError(f"it would unpack to {declared:,} bytes; the limit is {most_bytes:,}")
             if len(members) > _MOST_ARRAYS or len(names) < len(members):
                 raise ArchiveError(f"it has {len(members)} members with {len(names)} names")
-            return {one.filename.removesuffix(".npy"): _array(one.filename, archive.read(one)) for one in members}
+            return {
+                member.filename.removesuffix(".npy"): _array(member.filename, archive.read(member))
+                for member in members
+            }
     except ArchiveError:
         raise
-    except Exception as error:  # zipfile, zlib and NumPy raise all kinds for damaged files
+    except Exception as error:  # zipfile, zlib and NumPy raise various exceptions for damaged files
         raise ArchiveError(str(error) or type(error).__name__) from error
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compress: bool) -> None:
-    """Write an .npz file at once, so that a reader, or a kill, never finds half of it.
+    """Write an .npz file atomically: a reader never finds a partial file, even if this process is killed.
 
     Args:
-        path: the file; its folder is made.
-        arrays: by name.
-        compress: whether to compress it.
+        path: the file; its folder is created.
+        arrays: arrays by name.
+        compress: whether to compress the file.
     """
     save: Any = np.savez_compressed if compress else np.savez
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,16 +68,16 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], *, compress: bool
 
 
 def _array(name: str, content: bytes) -> np.ndarray:
-    """An array from the bytes of a .npy file, which have to be as many as its header says."""
+    """An array from the content of a .npy file, whose length must match its header."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
-        raise ArchiveError(f"{name}: version {version} of .npy files isn't read")
+        raise ArchiveError(f"{name}: unsupported version {version} of .npy files")
     shape, _, dtype = _HEADERS[version](stream)
     if dtype.hasobject or min(shape, default=0) < 0:
-        raise ArchiveError(f"{name}: arrays of {dtype} and shape {shape} aren't read")
+        raise ArchiveError(f"{name}: unsupported array of {dtype} and shape {shape}")
     if math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
-        raise ArchiveError(f"{name}: its header says shape {shape} of {dtype}, and its length is another")
+        raise ArchiveError(f"{name}: its length doesn't match its header (shape {shape} of {dtype})")
     stream.seek(0)
     array: np.ndarray = np.lib.format.read_array(stream, allow_pickle=False)
     return array

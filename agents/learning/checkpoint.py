@@ -1,4 +1,4 @@
-"""Checkpoints of a training run, as arrays and JSON in one .npz file: reading one runs no code of its author's."""
+"""Checkpoints of a training run, as arrays and JSON in one .npz file; reading one executes no code from the file."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _LAST = ("_last_obs", "_last_episode_starts", "_last_original_obs")
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that can't be read, or doesn't fit; the message says which file and what is wrong."""
+    """The checkpoint can't be read or doesn't fit; the message says which file and why."""
 
 
 def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
-    """Write nested mappings, sequences, dataclasses, generators, arrays, tensors and plain values; uncompressed."""
+    """Write nested mappings, sequences, dataclasses, generators, arrays, tensors and plain values, uncompressed."""
     arrays: list[np.ndarray] = []
     text = json.dumps({"format": FORMAT, "content": _encoded(content, arrays)})
     named = {str(number): array for number, array in enumerate(arrays)}
@@ -34,16 +34,16 @@ def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """What was written; dataclasses and generators as mappings of their fields, tensors as arrays.
+    """Read a checkpoint; dataclasses and generators become mappings of their fields, tensors become arrays.
 
     Raises:
-        CheckpointError: for a file that `write_checkpoint` didn't write.
+        CheckpointError: if the file wasn't written by `write_checkpoint`.
     """
     try:
-        arrays = read_arrays(path, path.stat().st_size)  # it isn't compressed
+        arrays = read_arrays(path, path.stat().st_size)  # uncompressed
         tree = json.loads(str(arrays["tree"]))
         if tree["format"] != FORMAT:
-            raise ValueError(f"its format is {tree['format']!r:.40}, this version reads {FORMAT}")
+            raise ValueError(f"its format is {tree['format']!r:.40}; expected {FORMAT}")
         content = _decoded(tree["content"], arrays)
         if not isinstance(content, dict):
             raise ValueError("it holds no settings")
@@ -53,27 +53,28 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def restored(template: Any, stored: Any, where: str) -> Any:
-    """Decoded values in the form of `template`, with its dataclasses and generators.
+    """Decoded values with the structure of `template`, dataclasses and generators included.
 
     Raises:
-        ValueError: naming the place where the two have different keys, lengths, types or shapes.
+        ValueError: if keys, lengths, types or shapes differ; the message names the place.
     """
     if isinstance(template, np.random.Generator):
         bits = type(template.bit_generator)()
         bits.state = stored
         return np.random.Generator(bits)
     if dataclasses.is_dataclass(template) and not isinstance(template, type):
-        fields = {one.name: getattr(template, one.name) for one in dataclasses.fields(template)}
+        fields = {field.name: getattr(template, field.name) for field in dataclasses.fields(template)}
         return type(template)(**restored(fields, stored, where))
     if isinstance(template, Mapping):
         if not isinstance(stored, dict) or list(stored) != list(template):
-            raise ValueError(f"{where} has other entries")
+            raise ValueError(f"{where} must have the entries {list(template)}")
         return {key: restored(value, stored[key], f"{where}.{key}") for key, value in template.items()}
     if isinstance(template, list | tuple):
         if type(stored) is not type(template) or len(stored) != len(template):
-            raise ValueError(f"{where} is another list")
+            raise ValueError(f"{where} must be a {type(template).__name__} of length {len(template)}")
         return type(template)(
-            restored(one, other, f"{where}[{q}]") for q, (one, other) in enumerate(zip(template, stored, strict=True))
+            restored(expected, value, f"{where}[{q}]")
+            for q, (expected, value) in enumerate(zip(template, stored, strict=True))
         )
     if type(stored) is not type(template):
         raise ValueError(f"{where} is of type {type(stored).__name__}, not {type(template).__name__}")
@@ -83,7 +84,7 @@ def restored(template: Any, stored: Any, where: str) -> Any:
 
 
 def model_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """All of a Stable-Baselines3 model that its next update depends on, but for a replay buffer."""
+    """The state of a Stable-Baselines3 model that its next update depends on, without a replay buffer."""
     _, variables = model._get_torch_save_params()
     return {
         "parameters": model.get_parameters(),
@@ -99,10 +100,10 @@ def model_state(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def restore_model(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
-    """Bring a new model of the same settings into the state that was saved.
+    """Restore the saved state of a model in a new one with the same settings.
 
     Raises:
-        ValueError: for what isn't such a state.
+        ValueError: if `stored` doesn't fit the model.
     """
     ours = model_state(model)
     for name, own in ours["parameters"].items():
@@ -126,9 +127,9 @@ def restore_model(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
 
 
 def _optimizer_state(optimizer: torch.optim.Optimizer, stored: Any, where: str) -> dict[str, Any]:
-    """What its `load_state_dict`, which checks nothing, may be given."""
+    """The stored state after checks, which `load_state_dict` doesn't make."""
     groups = restored(optimizer.state_dict()["param_groups"], stored["param_groups"], f"{where}.param_groups")
-    parameters = [one for group in optimizer.param_groups for one in group["params"]]
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for number, values in stored["state"].items():
         shape = tuple(parameters[number].shape)
         for name, value in values.items():
@@ -138,7 +139,7 @@ def _optimizer_state(optimizer: torch.optim.Optimizer, stored: Any, where: str) 
 
 
 def _encoded(value: Any, arrays: list[np.ndarray]) -> Any:
-    """A value as JSON has it; arrays go to the list, and their numbers stand for them."""
+    """A JSON value; arrays are appended to the list and replaced by their index."""
     if isinstance(value, np.ndarray | np.generic | torch.Tensor):
         arrays.append(value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value))
         return {"number" if isinstance(value, np.generic) else "array": len(arrays) - 1}
@@ -147,11 +148,11 @@ def _encoded(value: Any, arrays: list[np.ndarray]) -> Any:
     if isinstance(value, np.random.Generator):
         return _encoded(value.bit_generator.state, arrays)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _encoded({one.name: getattr(value, one.name) for one in dataclasses.fields(value)}, arrays)
+        return _encoded({field.name: getattr(value, field.name) for field in dataclasses.fields(value)}, arrays)
     if isinstance(value, Mapping):
-        return {"dict": [[key, _encoded(one, arrays)] for key, one in value.items()]}
+        return {"dict": [[key, _encoded(item, arrays)] for key, item in value.items()]}
     if isinstance(value, list | tuple):
-        return {type(value).__name__: [_encoded(one, arrays) for one in value]}
+        return {type(value).__name__: [_encoded(item, arrays) for item in value]}
     raise TypeError(f"a checkpoint can't hold {type(value).__name__}")
 
 
@@ -164,19 +165,19 @@ def _decoded(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     if kind == "number":
         return arrays[str(value)][()]
     if kind == "dict":
-        return {key: _decoded(one, arrays) for key, one in value}
-    return {"list": list, "tuple": tuple}[kind](_decoded(one, arrays) for one in value)
+        return {key: _decoded(item, arrays) for key, item in value}
+    return {"list": list, "tuple": tuple}[kind](_decoded(item, arrays) for item in value)
 
 
 def _arrays(value: Any) -> Any:
-    """Tensors, nested or not, as arrays."""
+    """Convert a tensor, or nested mappings of tensors, to arrays."""
     if isinstance(value, torch.Tensor):
         return value.detach().cpu().numpy()
-    return {key: _arrays(one) for key, one in value.items()}
+    return {key: _arrays(item) for key, item in value.items()}
 
 
 def _tensors(value: Any) -> Any:
-    """Arrays, nested or not, as tensors of their own memory."""
+    """Convert an array, or nested mappings of arrays, to tensors with memory of their own."""
     if isinstance(value, Mapping):
-        return {key: _tensors(one) for key, one in value.items()}
+        return {key: _tensors(item) for key, item in value.items()}
     return torch.tensor(value)

@@ -1,4 +1,4 @@
-"""What a training run is made of."""
+"""Settings of a training run."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ ALGORITHMS = ("ppo", "sac")
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Every choice of a training run; the defaults are those that worked on every task of the library.
+    """All settings of a training run; the defaults work for every task of the library.
 
     Attributes:
         environment: name of an environment (khop list), or a task of your own.
-        scenario: what `khop_env.scenario` takes, or a `Scenario`; None for the environment's own.
-        observe: states of agents beyond the neighbours: "estimate", "oracle" or "local".
-        bounds: whether observations hold the guaranteed bounds.
-        rates: whether networks get how fast positions change, too, as differences of observations.
+        scenario: what `khop_env.scenario` takes, or a `Scenario`; None for the environment's default.
+        observe: states of k-hop targets in observations: "estimate", "oracle" or "local".
+        bounds: whether observations include the guaranteed bounds.
+        rates: whether features include rates of change of positions, as differences of observations.
         algorithm: learning algorithm, "ppo" or "sac".
-        per_type: a network for each type of agent instead of one for all.
-        timesteps: agent-steps in all, of all copies together.
-        seed: seed of networks, episodes and exploration.
-        num_envs: copies of the environment, each of N agents.
-        hidden: widths of the networks' layers.
-        learning_rate: learning rate at the beginning; falls linearly to 0 with "ppo".
+        per_type: whether each agent type has its own network; by default all agents share one.
+        timesteps: agent-steps, summed over all environments.
+        seed: seed of networks, environments and exploration.
+        num_envs: number of environments, each with N agents.
+        hidden: widths of the hidden layers.
+        learning_rate: initial learning rate; decreases linearly to 0 with "ppo".
         gamma: discount per control period, from 0 to 1.
-        gae_lambda: lambda of the generalised advantage estimates, from 0 to 1; PPO.
+        gae_lambda: lambda of generalised advantage estimation, from 0 to 1; PPO.
         n_steps: control periods between updates; PPO.
-        batch_size: samples in a gradient step.
-        n_epochs: passes over the samples of an update; PPO.
-        clip_range: how far an update may change the probability of an action, as a fraction; PPO.
+        batch_size: samples per gradient step.
+        n_epochs: passes over the samples per update; PPO.
+        clip_range: clip range of the probability ratio; PPO.
         entropy: weight of the entropy bonus; PPO.
         log_std: logarithm of the initial standard deviation of actions; PPO.
-        huber: task error, in its unit, from which the training reward is linear in it; evaluation stays quadratic.
-        evaluations: how often the policy is evaluated on fixed seeds, and saved.
+        huber: task error, in its unit, above which the training reward is linear in it; evaluation stays quadratic.
+        evaluations: number of evaluations on fixed seeds; the policy is saved at each.
         arguments: further arguments of the environment by name, e.g. {"control_period": 0.1, "reward": "team"}.
 
     Raises:
-        ValueError: naming the attribute, what was given and what is expected.
+        ValueError: if a value is invalid; the message names the attribute, the value and what is expected.
     """
 
     environment: Environment
@@ -92,21 +92,23 @@ class TrainingConfig:
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a positive integer; got {value!r}")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise ValueError(f"seed must be an integer that isn't negative; got {self.seed!r}")
+            raise ValueError(f"seed must be a non-negative integer; got {self.seed!r}")
         if not self.hidden or not all(isinstance(width, int) and width > 0 for width in self.hidden):
-            raise ValueError(f"hidden must be the widths of at least one layer; got {self.hidden!r}")
+            raise ValueError(f"hidden must be the positive widths of at least one layer; got {self.hidden!r}")
         for name in ("learning_rate", "clip_range", "huber"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)!r}")
         if not 0.0 <= self.entropy < math.inf or not math.isfinite(self.log_std):
-            raise ValueError(f"entropy must not be negative, log_std finite; got {self.entropy!r} and {self.log_std!r}")
+            raise ValueError(
+                f"entropy must be non-negative and finite, log_std finite; got {self.entropy!r} and {self.log_std!r}"
+            )
         for name in ("gamma", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be from 0 to 1; got {getattr(self, name)!r}")
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON has it, the scenario by its name."""
-        values = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        """The settings as JSON values; environment and scenario by name."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         name = self.scenario.name if isinstance(self.scenario, Scenario) else self.scenario and str(self.scenario)
         environment = self.environment if isinstance(self.environment, str) else find_task(self.environment).name
         changed = {"environment": environment, "scenario": name, "hidden": list(self.hidden)}

@@ -1,4 +1,4 @@
-"""The environment as a learner sees it: scaled observations, shaped and normalised rewards, staggered episodes."""
+"""The training environment: scaled observations, robust and normalised rewards, staggered episodes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from khop_env.registry import make_batched
 
 
 def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
-    """The environment of a training run, as arrays.
+    """The environment of a training run as a `BatchedEnv`.
 
     Args:
-        config: names it.
-        num_envs: copies; those of the run by default.
+        config: names environment, scenario and observation mode.
+        num_envs: number of environments; by default that of the run.
 
     Raises:
-        ValueError: for an unknown environment or scenario, or a wrong argument of the environment.
+        ValueError: if environment or scenario is unknown, or an argument of the environment is wrong.
     """
     where = {} if config.scenario is None else {"scenario": config.scenario}
     count = config.num_envs if num_envs is None else num_envs
@@ -35,23 +35,23 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
 
 
 class TrainingVecEnv(VecEnvWrapper):
-    """Makes features of observations, and rewards in which rare large errors don't dominate (`Task.robust_reward`).
+    """Computes features of observations, and rewards not dominated by rare large errors (`Task.robust_reward`).
 
-    Copies begin at different times of their first episodes, so that not all of them end together.
+    Environments begin at different times of their first episodes, so that the ends of episodes are spread.
 
     Args:
         venv: the environment.
-        scaler: makes the features.
-        huber: error from which rewards grow linearly only, in the unit of the task error.
+        scaler: computes the features.
+        huber: error above which rewards are linear in it, in the unit of the task error.
     """
 
     def __init__(self, venv: KHopSB3VecEnv, scaler: ObservationScaler, huber: float) -> None:
         super().__init__(venv, Box(-MOST, MOST, (scaler.size,), np.float32))
         self.batched, self.source, self.scaler, self._huber = venv.batched, venv, scaler, huber
-        self.before = np.zeros(0, np.float32)  # observations of the last step
+        self.before = np.zeros(0, np.float32)  # observations of the previous step
 
     def reset(self) -> Float32Array:
-        """Start new, staggered episodes."""
+        """Start new, staggered episodes; features (num_envs * N, size)."""
         self.before = np.asarray(self.venv.reset())
         state, horizon = self.batched.get_state(), self.batched.settings.max_cycles
         staggered = np.arange(self.batched.num_envs) * horizon // self.batched.num_envs
@@ -59,24 +59,24 @@ class TrainingVecEnv(VecEnvWrapper):
         return self.scaler(self.before, None)
 
     def step_wait(self) -> tuple[Float32Array, Float32Array, np.ndarray, list[dict[str, Any]]]:
-        """Advance and shape."""
+        """Advance by one control period; features, robust rewards, dones and infos, one row per agent."""
         observations, reward, done, infos = self.venv.step_wait()
-        seen, before = np.asarray(observations), self.before
-        by_copy = np.asarray(reward).reshape(self.batched.num_envs, -1)
-        softened = self.batched.task.robust_reward(by_copy, self.source.infos, self._huber)
+        current, before = np.asarray(observations), self.before
+        by_env = np.asarray(reward).reshape(self.batched.num_envs, -1)
+        softened = self.batched.task.robust_reward(by_env, self.source.infos, self._huber)
         rows = np.flatnonzero(done)
         if rows.size:
             last = self.scaler(np.stack([infos[row]["terminal_observation"] for row in rows]), before[rows])
             for row, features in zip(rows, last, strict=True):
                 infos[row]["terminal_observation"] = features
             before = before.copy()
-            before[rows] = seen[rows]  # a new episode: nothing has changed yet
-        self.before = seen
-        return self.scaler(seen, before), softened.reshape(-1).astype(np.float32), done, infos
+            before[rows] = current[rows]  # a new episode: no change yet
+        self.before = current
+        return self.scaler(current, before), softened.reshape(-1).astype(np.float32), done, infos
 
 
 def training_environment(config: TrainingConfig) -> VecNormalize:
-    """What Stable-Baselines3 is given; only rewards are normalised by running statistics."""
+    """The environment that Stable-Baselines3 trains on; only rewards are normalised by running statistics."""
     batched = build(config)
     scaler = ObservationScaler.of(describe(batched), config.rates)
     wrapped = TrainingVecEnv(KHopSB3VecEnv(batched), scaler, config.huber)

@@ -1,4 +1,4 @@
-"""What an environment is made of, in plain values that can be stored and compared."""
+"""Fingerprint of an environment: its configuration as plain values, to be stored and compared."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from khop_env.env import BatchedEnv
 from khop_env.scenarios import Scenario
 from khop_env.tasks import Task
 
-_IRRELEVANT = ("name", "description", "law", "duration", "dt", "order")  # of a scenario, to an environment
-_SHOWN = 3
+_IRRELEVANT = ("name", "description", "law", "duration", "dt", "order", "figure_agent")  # fields of a scenario
+_LISTED = 3  # differences
 
 
 def fingerprint(scenario: Scenario, env: BatchedEnv) -> dict[str, Any]:
-    """All that the numbers of an environment depend on, as JSON has it.
+    """Everything that the numbers of an environment depend on, as JSON values.
 
     Args:
-        scenario: what it was made from.
+        scenario: scenario of the environment.
         env: the environment.
     """
-    parts = {one.name: getattr(scenario, one.name) for one in dataclasses.fields(scenario)}
+    parts = {field.name: getattr(scenario, field.name) for field in dataclasses.fields(scenario)}
     return {
         "task": {**env.task.signature(env.world), **_parameters(env.task)},
         "scenario": plain({name: value for name, value in parts.items() if name not in _IRRELEVANT}),
@@ -34,27 +34,27 @@ def fingerprint(scenario: Scenario, env: BatchedEnv) -> dict[str, Any]:
 
 
 def _parameters(task: Task) -> dict[str, Any]:
-    """The arguments that a task was made with, where it is a dataclass."""
+    """The arguments of a task that is a dataclass."""
     fields: tuple[Any, ...] = dataclasses.fields(task) if dataclasses.is_dataclass(task) else ()
     return {each.name: plain(getattr(task, each.name)) for each in fields if each.init}
 
 
-def differences(one: Any, other: Any) -> str:
-    """Up to three places where two fingerprints differ, with both values; empty where there are none."""
-    found = list(_differences(one, other, ""))
-    return "; ".join(found[:_SHOWN] + [f"and {len(found) - _SHOWN} more"] * (len(found) > _SHOWN))
+def differences(saved: Any, current: Any) -> str:
+    """Up to three places where two fingerprints differ, with both values; empty if they are equal."""
+    places = list(_differences(saved, current, ""))
+    return "; ".join(places[:_LISTED] + [f"and {len(places) - _LISTED} more"] * (len(places) > _LISTED))
 
 
-def _differences(one: Any, other: Any, where: str) -> Iterator[str]:
-    if isinstance(one, dict) and isinstance(other, dict):
-        for key in {**one, **other}:
+def _differences(saved: Any, current: Any, where: str) -> Iterator[str]:
+    if isinstance(saved, dict) and isinstance(current, dict):
+        for key in {**saved, **current}:
             place = f"{where}.{key}" if where else str(key)
-            yield from _differences(one.get(key, "missing"), other.get(key, "missing"), place)
-    elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
-        for number, (mine, its) in enumerate(zip(one, other, strict=True)):
-            yield from _differences(mine, its, f"{where}[{number}]")
-    elif one != other:
-        yield f"{where} is {_short(one)} there and {_short(other)} here"
+            yield from _differences(saved.get(key, "missing"), current.get(key, "missing"), place)
+    elif isinstance(saved, list | tuple) and isinstance(current, list | tuple) and len(saved) == len(current):
+        for number, pair in enumerate(zip(saved, current, strict=True)):
+            yield from _differences(*pair, f"{where}[{number}]")
+    elif saved != current:
+        yield f"{where} is {_short(saved)} there and {_short(current)} here"
 
 
 def _short(value: Any) -> str:
@@ -64,21 +64,21 @@ def _short(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Mappings, lists and plain values; objects as their type and attributes."""
+    """Convert to mappings, lists and plain values; an object becomes its type and attributes."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     if isinstance(value, nx.Graph):
         return sorted(sorted(edge) for edge in value.edges)
     if callable(value) and hasattr(value, "__qualname__"):
         return f"{value.__module__}.{value.__qualname__}"
     if dataclasses.is_dataclass(value):
-        parts = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     else:
-        parts = {name: one for name, one in getattr(value, "__dict__", {}).items() if not name.startswith("_")}
-    return {"type": type(value).__name__, **{name: plain(one) for name, one in parts.items()}}
+        parts = {name: item for name, item in getattr(value, "__dict__", {}).items() if not name.startswith("_")}
+    return {"type": type(value).__name__, **{name: plain(item) for name, item in parts.items()}}

@@ -1,4 +1,4 @@
-"""A learned policy: networks in plain NumPy, so that acting needs neither torch nor Stable-Baselines3."""
+"""Learned policies: networks in plain NumPy, evaluated without torch and Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ PRETRAINED = Path(__file__).with_name("pretrained")
 
 @dataclass(eq=False)
 class LearnedPolicy:
-    """Networks that map features of observations to actions; deterministic, with a memory of one observation at most.
+    """Networks from features of observations to actions; deterministic, with the previous observation as only memory.
 
-    Where episodes of a batch end at different times, as with autoreset, the first features after an end hold a change
-    that spans both episodes; `reset` forgets the observation before.
+    If episodes of a batch end at different times, as with autoreset, the first rates of change after an end span both
+    episodes; `reset` drops the previous observation.
 
     Attributes:
-        environment: what it was trained for.
-        columns: names of the observation's columns.
-        action_size: entries of an action.
-        squash: whether the outputs pass through tanh (SAC) or are cut off at 1 (PPO).
-        networks: layers by agent type; the same under "" for all types.
-        scaler: applied first.
-        about: how it was trained.
+        environment: name of the environment it was trained for.
+        columns: names of the columns of an observation.
+        action_size: number of entries of an action.
+        squash: whether outputs pass through tanh (SAC); otherwise they are clipped to [-1, 1] (PPO).
+        networks: layers by agent type, or under "" for all types.
+        scaler: computes the features of observations.
+        about: settings and versions of the training run.
     """
 
     environment: str
@@ -45,36 +45,36 @@ class LearnedPolicy:
     _before: Float32Array | None = field(default=None, init=False, repr=False)
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Check that it was trained for this environment's observations and actions.
+        """Check that the policy fits the environment's observations and actions.
 
         Raises:
-            PolicyFileError: saying what differs.
+            PolicyFileError: if it doesn't; the message says what differs.
         """
         if env.environment != self.environment:
             raise PolicyFileError(f"it was trained for {self.environment}, not for {env.environment}")
         sizes, columns = sorted(set(env.action_sizes.values())), columns_of(env)
         where = self.about.get("scenario", "another scenario")
         if len({len(layout) for layout in env.layouts.values()}) > 1:
-            raise PolicyFileError("it needs uniform observations: make the environment with uniform=True")
+            raise PolicyFileError("it needs uniform observations: create the environment with uniform=True")
         if sizes != [self.action_size]:
             raise PolicyFileError(
-                f"it was trained on {where} with {self.action_size} entries per action, here are {sizes}; train one "
-                f"for {env.scenario}"
+                f"it was trained on {where} with {self.action_size} entries per action; this environment has {sizes}; "
+                f"train a policy for {env.scenario}"
             )
         period = RATE / self.scaler.rate
         if abs(env.control_period - period) > 1e-9:
             raise PolicyFileError(
-                f"it was trained to act every {period:g} s, here agents act every {env.control_period:g} s"
+                f"it was trained with a control period of {period:g} s; this environment has {env.control_period:g} s"
             )
         if columns != self.columns:
             pairs = enumerate(zip(self.columns, columns, strict=False))
             differs = next(
-                (f"column {q} is {mine!r} there and {its!r} here" for q, (mine, its) in pairs if mine != its),
-                "the first columns agree",
+                (f"column {q} is {own!r} there and {name!r} here" for q, (own, name) in pairs if own != name),
+                "the common columns agree",
             )
             raise PolicyFileError(
-                f"it was trained on {where} with {len(self.columns)} columns of observations, here are {len(columns)}: "
-                f"{differs}; train one for this environment, or make it with the same scenario and bounds"
+                f"it was trained on {where} with {len(self.columns)} observation columns; this environment has "
+                f"{len(columns)}: {differs}; train a policy for it, or create it with the same scenario and bounds"
             )
         types = {model.type for model in env.models.values()}
         if "" not in self.networks and (missing := types - set(self.networks)):
@@ -82,20 +82,21 @@ class LearnedPolicy:
         self._types, self._before = {agent: model.type for agent, model in env.models.items()}, None
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """The networks' outputs, in [-1, 1]."""
-        seen = np.stack([observations[agent] for agent in observations])
+        """Actions (..., action_size) in [-1, 1] by agent."""
+        stacked = np.stack([observations[agent] for agent in observations])
         before = self._before
-        if before is not None and before.shape != seen.shape:
+        if before is not None and before.shape != stacked.shape:
             raise ValueError(
-                f"observations of another batch, {seen.shape[1:-1]} after {before.shape[1:-1]}: call reset() first"
+                f"the batch of observations changed from {before.shape[1:-1]} to {stacked.shape[1:-1]}: call reset() "
+                "first"
             )
-        features = self.scaler(seen, before)
-        self._before = seen
+        features = self.scaler(stacked, before)
+        self._before = stacked
         if "" in self.networks:
             return dict(zip(observations, self._forward(features, self.networks[""]), strict=True))
         return {
-            agent: self._forward(mine, self.networks[self._types[agent]])
-            for agent, mine in zip(observations, features, strict=True)
+            agent: self._forward(row, self.networks[self._types[agent]])
+            for agent, row in zip(observations, features, strict=True)
         }
 
     def _forward(self, values: Float32Array, layers: Layers) -> Float32Array:
@@ -106,69 +107,69 @@ class LearnedPolicy:
         return np.tanh(values) if self.squash else np.clip(values, -1.0, 1.0)
 
     def save(self, path: Path) -> None:
-        """Write everything into one .npz file."""
-        write_policy(path, {one.name: getattr(self, one.name) for one in fields(self) if one.init})
+        """Write the policy into one .npz file."""
+        write_policy(path, {each.name: getattr(self, each.name) for each in fields(self) if each.init})
 
     @classmethod
     def load(cls, path: str | Path) -> LearnedPolicy:
-        """Read a policy that `save` wrote.
+        """Read a policy written by `save`.
 
         Args:
-            path: the file, or the folder of a training run, whose best policy is meant then.
+            path: the file, or the folder of a training run, of which the best policy is read.
 
         Raises:
-            PolicyFileError: if there is none, or it isn't one.
+            PolicyFileError: if there is no such file, or it isn't a policy.
         """
         path = Path(path)
         if path.is_dir():
             path = path / "best.npz"
         if not path.exists():
-            raise PolicyFileError(f"there is no policy {path}; khop train writes a folder with best.npz and last.npz")
+            raise PolicyFileError(f"no policy file {path}; khop train writes a folder with best.npz and last.npz")
         return cls(**read_policy(path))
 
 
 class PretrainedPolicy:
-    """The shipped policy for an environment and scenario, found when it is known which these are.
+    """The shipped policy for an environment and scenario, loaded at reset, when both are known.
 
     Args:
-        environment: what it was trained for; None for wherever it plays.
+        environment: name of the environment it was trained for; None for the environment at reset.
     """
 
     def __init__(self, environment: str | None = None) -> None:
         self.environment = environment
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Load it.
+        """Load the policy.
 
         Raises:
             PolicyFileError: if none is shipped for this environment and scenario, or it doesn't fit.
         """
         if self.environment not in (None, env.environment):
-            raise PolicyFileError(f"the policy for {self.environment} was asked for, and this is {env.environment}")
+            raise PolicyFileError(f"the policy for {self.environment} doesn't fit {env.environment}")
         path = PRETRAINED / f"{pretrained_name(env.environment, env.scenario)}.npz"
         if not path.exists():
             raise PolicyFileError(
-                f"no pretrained policy for {env.environment} on {env.scenario}; there are: {_shipped()}. "
-                f"Train one: khop train {env.environment} --scenario {env.scenario}"
+                f"no pretrained policy for {env.environment} on {env.scenario}; available: {_shipped()}. "
+                f"To train one: khop train {env.environment} --scenario {env.scenario}"
             )
         self._policy = LearnedPolicy.load(path)
         self._policy.reset(env, seeds)
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """Its actions."""
+        """Actions (..., m) in [-1, 1] by agent."""
         return self._policy.act(observations)
 
     def about_for(self, scenario: str) -> Mapping[str, Any]:
-        """How the policy for a scenario, by name, was trained.
+        """Settings and versions of the training run of the policy for a scenario.
 
         Raises:
-            PolicyFileError: if none is shipped for it, or several are and no environment was named.
+            PolicyFileError: if none is shipped for the scenario, or several are and no environment was named.
         """
         ending = pretrained_name(self.environment or "", scenario)
         found = sorted(path for path in PRETRAINED.glob("*.npz") if path.stem.endswith(ending))
         if not found:
             wanted = f"{self.environment} on {scenario}" if self.environment else scenario
-            raise PolicyFileError(f"no pretrained policy for {wanted}; there are: {_shipped()}")
+            raise PolicyFileError(f"no pretrained policy for {wanted}; available: {_shipped()}")
         if len(found) > 1:
             names = " or ".join(f"ppo:pretrained/{path.stem.removesuffix(ending)}" for path in found)
             raise PolicyFileError(f"there are {len(found)} pretrained policies for {scenario}: choose {names}")
@@ -176,14 +177,14 @@ class PretrainedPolicy:
 
 
 def pretrained_name(environment: str, scenario: str) -> str:
-    """File name, without ending, of the shipped policy for an environment on a scenario, both by name."""
+    """File name, without suffix, of the shipped policy for an environment and a scenario, both by name."""
     return f"{environment}@{scenario.replace(':', '-').replace(',', '-').replace('=', '')}"
 
 
 def _shipped() -> str:
-    return ", ".join(sorted(one.stem.replace("@", " on ") for one in PRETRAINED.glob("*.npz"))) or "none"
+    return ", ".join(sorted(path.stem.replace("@", " on ") for path in PRETRAINED.glob("*.npz"))) or "none"
 
 
 def columns_of(env: EnvDescription) -> tuple[str, ...]:
-    """Names of the columns of uniform observations: those of the agent with most slots."""
+    """Column names of uniform observations, from the agent with most slots."""
     return max(env.layouts.values(), key=lambda layout: len(layout.slots)).names

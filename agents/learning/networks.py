@@ -1,4 +1,4 @@
-"""Stable-Baselines3 models of a training run, and their actors as arrays."""
+"""Stable-Baselines3 models of a training run, and their export as arrays."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from agents.learning.scaling import ObservationScaler
 
 
 class PerTypeExtractor(nn.Module):
-    """A network for each type of agent, chosen by the type's one-hot in the observation.
+    """A network for each agent type, selected by the type's one-hot columns in the observation.
 
-    Each type's features stand in a block of their own, with a constant 1, and are zero elsewhere, so that the linear
-    heads which Stable-Baselines3 puts on top are separate for each type; only a bias that is added to all, and the
-    standard deviation of the exploration, are shared.
+    Each type's latent features, with a constant 1, have a block of their own and are zero elsewhere, so that the linear
+    heads added by Stable-Baselines3 are separate for each type; only one bias and the standard deviation of the
+    exploration are shared.
 
     Args:
-        features: entries of an observation.
-        hidden: widths of the layers.
+        features: number of features.
+        hidden: widths of the hidden layers.
         types: columns of the one-hot.
     """
 
@@ -40,34 +40,34 @@ class PerTypeExtractor(nn.Module):
         self.latent_dim_pi = self.latent_dim_vf = len(self.types) * (hidden[-1] + 1)
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Latent features of actor and critic."""
+        """Latent features of actor and critic, each (batch, blocks)."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        """Those of the actor."""
+        """Latent features of the actor (batch, blocks)."""
         return self._blocks(self.actors, features)
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
-        """Those of the critic."""
+        """Latent features of the critic (batch, blocks)."""
         return self._blocks(self.critics, features)
 
     def _blocks(self, networks: nn.ModuleList, features: torch.Tensor) -> torch.Tensor:
-        one = torch.ones_like(features[:, :1])
+        constant = torch.ones_like(features[:, :1])
         blocks = [
-            features[:, [column]] * torch.cat([network(features), one], dim=1)
+            features[:, [column]] * torch.cat([network(features), constant], dim=1)
             for column, network in zip(self.types, networks, strict=True)
         ]
         return torch.cat(blocks, dim=1)
 
 
 class PerTypePolicy(ActorCriticPolicy):
-    """PPO's policy with a network for each type of agent.
+    """PPO's policy with a network for each agent type.
 
     Args:
-        arguments: Stable-Baselines3's own.
+        arguments: positional arguments of `ActorCriticPolicy`.
         types: columns of the one-hot.
         hidden: widths of the layers.
-        keywords: Stable-Baselines3's own.
+        keywords: keyword arguments of `ActorCriticPolicy`.
     """
 
     def __init__(self, *arguments: Any, types: Sequence[int], hidden: Sequence[int], **keywords: Any) -> None:
@@ -86,9 +86,9 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
 
     Args:
         config: the settings.
-        env: what `training_environment` gives.
+        env: the environment from `training_environment`.
         types: columns of the one-hot of agent types.
-        log: folder for TensorBoard, or None.
+        log: folder for TensorBoard, or None for no log.
     """
     common: dict[str, Any] = {"seed": config.seed, "gamma": config.gamma, "tensorboard_log": log, "device": "cpu"}
     net: dict[str, Any] = {"activation_fn": nn.ReLU}
@@ -129,7 +129,7 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
 
 
 def _divisor(samples: int, wanted: int) -> int:
-    """The batch size near the wanted one that divides an update's samples."""
+    """The batch size near the wanted value that divides the number of samples per update."""
     count = max(1, round(samples / wanted))
     while samples % count:
         count += 1
@@ -137,22 +137,22 @@ def _divisor(samples: int, wanted: int) -> int:
 
 
 class LinearlyTo0:
-    """A learning rate that falls linearly to 0 with what remains of the training.
+    """A learning rate that decreases linearly to 0 over the training.
 
     Args:
-        rate: at the beginning.
+        rate: initial learning rate.
     """
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
 
     def __call__(self, remaining: float) -> float:
-        """The rate with a fraction `remaining` still to go."""
+        """The learning rate when the fraction `remaining` of the training is left."""
         return self.rate * max(0.0, remaining)
 
 
 def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers]:
-    """The deterministic actor as arrays, by type of agent ("" for all).
+    """The deterministic actor as arrays, by agent type ("" for all types).
 
     Args:
         model: PPO or SAC.
@@ -164,13 +164,13 @@ def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers
     extractor, head = policy.mlp_extractor, policy.action_net
     if not isinstance(extractor, PerTypeExtractor):
         return {"": _layers([*extractor.policy_net, head])}
-    found = {}
-    weight, bias = (one.detach().numpy().copy() for one in (head.weight, head.bias))
+    networks = {}
+    weight, bias = (parameter.detach().numpy().copy() for parameter in (head.weight, head.bias))
     width = weight.shape[1] // len(types)
     for number, kind in enumerate(types):
         block = weight[:, number * width : (number + 1) * width]
-        found[kind] = (*_layers(extractor.actors[number]), (block[:, :-1].copy(), bias + block[:, -1]))
-    return found
+        networks[kind] = (*_layers(extractor.actors[number]), (block[:, :-1].copy(), bias + block[:, -1]))
+    return networks
 
 
 def exported(
@@ -186,12 +186,12 @@ def exported(
 
     Args:
         model: PPO or SAC.
-        config: of the run.
+        config: settings of the run.
         environment: name of the environment.
         columns: names of the observation's columns.
-        types: of agents.
-        scaler: of observations.
-        about: how it was trained.
+        types: names of the agent types, in the order of the one-hot.
+        scaler: scaler of observations.
+        about: settings and versions of the training run.
     """
     shape = model.action_space.shape
     assert shape is not None
@@ -208,7 +208,7 @@ def _mlp(features: int, hidden: Sequence[int]) -> nn.Sequential:
 
 def _layers(modules: Any) -> Layers:
     return tuple(
-        (one.weight.detach().numpy().astype(np.float32), one.bias.detach().numpy().astype(np.float32))
-        for one in modules
-        if isinstance(one, nn.Linear)
+        (layer.weight.detach().numpy().astype(np.float32), layer.bias.detach().numpy().astype(np.float32))
+        for layer in modules
+        if isinstance(layer, nn.Linear)
     )

@@ -1,4 +1,4 @@
-"""A learned policy as a file: what `khop train` writes, and what is checked of a file that comes from anybody."""
+"""Policy files: written by `khop train`; files from untrusted sources are checked completely on reading."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from agents.learning.scaling import ObservationScaler
 from khop_env.env.layout import Float32Array
 
 FORMAT = 1
-MOST_BYTES = 2**28  # of a policy's arrays; the shipped ones have less than a thousandth of it
+MOST_BYTES = 2**28  # limit on a policy's arrays; the shipped policies have less than a thousandth of it
 _INDICES = ("valid", "moving", "headed", "heading", "planar")
 _ABOUT = {"algorithm": str, "environment": str, "scenario": str, "bounds": bool}
 
@@ -25,7 +25,7 @@ Layers = tuple[tuple[Float32Array, Float32Array], ...]
 
 
 class PolicyFileError(ValueError):
-    """A policy that can't be read, or doesn't fit; the message says which file and what is wrong."""
+    """The policy can't be read or doesn't fit the environment; the message says which file and why."""
 
 
 def write_policy(path: Path, fields: Mapping[str, Any]) -> None:
@@ -33,7 +33,7 @@ def write_policy(path: Path, fields: Mapping[str, Any]) -> None:
 
     Args:
         path: the file.
-        fields: of `LearnedPolicy`, by name.
+        fields: fields of `LearnedPolicy`, by name.
     """
     networks: Mapping[str, Layers] = fields["networks"]
     meta = {
@@ -55,10 +55,10 @@ def write_policy(path: Path, fields: Mapping[str, Any]) -> None:
 
 
 def read_policy(path: Path) -> dict[str, Any]:
-    """The fields of `LearnedPolicy` from a file, all of them checked.
+    """Read and check the fields of `LearnedPolicy`.
 
     Raises:
-        PolicyFileError: for a file that `write_policy` didn't write.
+        PolicyFileError: if the file wasn't written by `write_policy`.
     """
     try:
         return _fields(read_arrays(path, MOST_BYTES))
@@ -69,21 +69,21 @@ def read_policy(path: Path) -> dict[str, Any]:
 
 def _fields(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     stored = arrays["meta"]
-    _require(stored.shape == () and stored.dtype.kind == "U", "meta isn't a text")
+    _require(stored.shape == () and stored.dtype.kind == "U", "meta isn't a string")
     meta = json.loads(str(stored))
     _require(isinstance(meta, dict), "meta isn't a JSON object")
     if meta["format"] != FORMAT:
-        raise ArchiveError(f"its format is {meta['format']!r:.40}, this version reads {FORMAT}")
+        raise ArchiveError(f"its format is {meta['format']!r:.40}; expected {FORMAT}")
     for name, kind in {"environment": str, "columns": list, "action_size": int, "squash": bool}.items():
         _require(type(meta[name]) is kind, f"{name} isn't of type {kind.__name__}")
     columns, about, counts = meta["columns"], meta["about"], meta["layers"]
-    _require(bool(columns) and all(isinstance(name, str) for name in columns), "columns aren't names")
+    _require(bool(columns) and all(isinstance(name, str) for name in columns), "columns isn't a list of names")
     _require(meta["action_size"] > 0, "action_size isn't positive")
     for name, kind in _ABOUT.items():
         _require(isinstance(about, dict) and type(about.get(name)) is kind, f"about has no {name}")
     _require(about["algorithm"] in ALGORITHMS, f"the algorithm is {about['algorithm']!r:.40}")
     _require(isinstance(counts, dict) and bool(counts), "it has no networks")
-    _require(all(type(count) is int and 0 < count <= 100 for count in counts.values()), "numbers of layers are wrong")
+    _require(all(type(count) is int and 0 < count <= 100 for count in counts.values()), "numbers of layers are invalid")
     scaler = _scaler(arrays, len(columns))
     networks = {kind: _layers(arrays, kind, count, scaler.size, meta["action_size"]) for kind, count in counts.items()}
     return {
@@ -98,7 +98,7 @@ def _fields(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _scaler(arrays: Mapping[str, np.ndarray], columns: int) -> ObservationScaler:
-    """The scaler, whose index arrays stay within what they index."""
+    """The scaler, with its index arrays checked against the number of columns."""
     scale, rate = _numbers(arrays, "scale", (columns,)), arrays["rate"]
     _require(rate.shape == () and rate.dtype.kind in "fi" and 0.0 < float(rate) < math.inf, "rate isn't positive")
     moving = len(arrays["moving"]) if arrays["moving"].ndim else 0
@@ -110,14 +110,14 @@ def _scaler(arrays: Mapping[str, np.ndarray], columns: int) -> ObservationScaler
         _require(bool(np.all((index >= 0) & (index < limit))), f"{name} is out of range")
         found[name] = index
     headed, planar = len(found["headed"]), found["planar"]
-    _require(len(found["valid"]) == columns, "valid is of another length")
+    _require(len(found["valid"]) == columns, "valid has the wrong length")
     _require(len(found["heading"]) == (2 if headed else 0), "heading isn't a pair of columns")
     _require(planar.shape[1] == 2 and (headed > 0 or not len(planar)), "planar doesn't hold pairs")
     return ObservationScaler(scale=scale, rate=float(rate), **found)
 
 
 def _layers(arrays: Mapping[str, np.ndarray], kind: str, count: int, inputs: int, outputs: int) -> Layers:
-    """The layers of a network, each of which takes what the one before gives."""
+    """The layers of a network, with their shapes checked against each other."""
     layers, width = [], inputs
     for number in range(count):
         name = f"{kind}/{number}"
@@ -130,8 +130,8 @@ def _layers(arrays: Mapping[str, np.ndarray], kind: str, count: int, inputs: int
 
 def _numbers(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> Float32Array:
     array = arrays[name]
-    _require(array.dtype == np.float32, f"{name} has {array.dtype} for float32")
-    _require(array.shape == shape, f"{name} has shape {array.shape} for {shape}")
+    _require(array.dtype == np.float32, f"{name} has dtype {array.dtype}; expected float32")
+    _require(array.shape == shape, f"{name} has shape {array.shape}; expected {shape}")
     _require(bool(np.isfinite(array).all()), f"{name} isn't finite")
     return array
 

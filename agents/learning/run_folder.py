@@ -1,4 +1,4 @@
-"""The folder of a training run: one training at a time, and files that are never half written."""
+"""The folder of a training run: locked during training, with files written atomically."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ CHECKPOINT = "checkpoint.npz"
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Make a folder, and keep other trainings out of it; the lock ends with the process, however that ends.
+    """Create a folder and lock it against other trainings; the lock ends with the process in any case.
 
     Raises:
-        FileExistsError: if a training is going on there.
+        FileExistsError: if another training is running there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = filelock.FileLock(folder / ".lock")
@@ -28,7 +28,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except filelock.Timeout:
         raise FileExistsError(
-            f"another training is going on in {folder}: wait for its end, or choose another folder"
+            f"another training is running in {folder}: wait for its end, or choose another folder"
         ) from None
     try:
         yield
@@ -37,29 +37,29 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
-    """The checkpoint of a folder, if it is of a run with these settings or with fewer timesteps.
+    """The checkpoint of a run with the same settings, except that `timesteps` may have been smaller.
 
     Raises:
-        CheckpointError: if it isn't one.
-        ValueError: if it is of a run with other settings.
+        CheckpointError: if the file isn't a checkpoint.
+        ValueError: if the settings differ; the message lists them.
     """
-    path, ours = folder / CHECKPOINT, config.as_dict()
+    path, current = folder / CHECKPOINT, config.as_dict()
     saved = read_checkpoint(path)
-    theirs = saved.get("config")
-    if not isinstance(theirs, dict) or not isinstance(theirs.get("timesteps"), int) or "fingerprint" not in saved:
+    stored = saved.get("config")
+    if not isinstance(stored, dict) or not isinstance(stored.get("timesteps"), int) or "fingerprint" not in saved:
         raise CheckpointError(f"{path} isn't a checkpoint that khop train wrote (it has no settings)")
-    theirs = {"arguments": {}, **theirs}  # runs of earlier versions had none
-    differs = [key for key in ours if theirs.get(key) != ours[key]]
-    if theirs["timesteps"] < config.timesteps:
+    stored = {"arguments": {}, **stored}  # runs of earlier versions had none
+    differs = [key for key in current if stored.get(key) != current[key]]
+    if stored["timesteps"] < config.timesteps:
         differs.remove("timesteps")
     if differs:
-        said = ", ".join(f"{key} = {theirs.get(key)!r} there and {ours[key]!r} here" for key in differs)
-        raise ValueError(f"{folder} holds a run with other settings: {said}; resume with the same")
+        text = ", ".join(f"{key} = {stored.get(key)!r} there and {current[key]!r} here" for key in differs)
+        raise ValueError(f"{folder} holds a run with other settings: {text}; resume with the same settings")
     return saved
 
 
 def write(path: Path, text: str) -> None:
-    """Replace a file at once, so that a kill never leaves half of it."""
+    """Write a text file atomically: a kill never leaves a partial file."""
     partial = path.with_name(f".{path.name}.part")
     partial.write_text(text, encoding="utf-8")
     partial.replace(path)

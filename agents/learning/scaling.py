@@ -1,4 +1,4 @@
-"""From an observation to what a network gets: fixed scales, and nothing where a slot is empty."""
+"""Features of observations for networks: fixed scales, invalid slots set to zero, rates of change."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from khop_env.env import ObservationLayout
 from khop_env.env.layout import Float32Array
 from khop_env.tasks.edges import axis_names
 
-METRE = 0.5  # a network's unit is 2 m, or 2 m/s
-RATE = 0.25  # and 4 m/s in how fast positions change
-MOST = 10.0  # larger scaled values are cut off: early policies run far away
+METRE = 0.5  # lengths are in units of 2 m, speeds in units of 2 m/s
+RATE = 0.25  # rates of change of positions are in units of 4 m/s
+MOST = 10.0  # features are clipped to this magnitude: agents under early policies move far away
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationScaler:
-    """Makes a network's features of uniform observations: scaled columns, and how fast positions change.
+    """Computes features of uniform observations: scaled columns, and rates of change of positions.
 
     Each slot is multiplied by its validity, and agents with a heading get others' positions and displacements in their
-    own frame, in which their inputs act. Scales are constants, not running statistics: early policies drift far away
-    and would spoil these. Changes are differences to the observation before, so that a policy knows how fast agents
-    move whose velocity isn't a state, as estimates of it allow.
+    own frame, in which their inputs act. Scales are constants, not running statistics, which agents under early
+    policies, far away, would distort. Rates are differences to the previous observation: they indicate the velocity of
+    agents whose state doesn't contain it, as far as estimates allow.
 
     Attributes:
         scale: (D,) factor of each column.
-        valid: (D,) the column whose value says whether this one counts; D, for a constant 1, outside of slots.
-        moving: (R,) columns that are positions; empty for features of a single observation.
-        rate: factor of their changes, per m.
-        headed: (H,) columns that say that an agent's type has a heading; empty where none has.
-        heading: (2,) columns of its cosine and sine.
-        planar: (K, 2) features that are turned into the own frame, in pairs.
+        valid: (D,) index of the column with each column's validity; D, for a constant 1, outside of slots.
+        moving: (R,) columns of positions; empty if features hold no rates.
+        rate: factor of the differences of positions, in 1/m.
+        headed: (H,) one-hot columns of the agent types with a heading; empty if there are none.
+        heading: (2,) columns of the heading's cosine and sine.
+        planar: (K, 2) pairs of features that are rotated into the agent's own frame.
     """
 
     scale: Float32Array
@@ -47,14 +47,14 @@ class ObservationScaler:
 
     @classmethod
     def of(cls, env: EnvDescription, rates: bool) -> ObservationScaler:
-        """Scales by unit.
+        """The scaler of an environment, with scales by unit.
 
         Args:
-            env: the environment, with uniform observations.
-            rates: whether features hold changes.
+            env: description of an environment with uniform observations.
+            rates: whether features include rates of change.
 
         Raises:
-            ValueError: for agents whose positions stand in different columns.
+            ValueError: if own positions are in different columns for different agents.
         """
         layouts = list(env.layouts.values())
         units = zip(*([field.unit for field in layout.fields] for layout in layouts), strict=True)
@@ -92,7 +92,7 @@ class ObservationScaler:
 
         Args:
             observations: (..., D).
-            before: those one control period earlier; None at the beginning of an episode, whose changes are 0.
+            before: (..., D) one control period earlier; None at the beginning of an episode, where rates are 0.
         """
         shape = observations.shape[:-1]
         features = np.zeros((*shape, self.size), np.float32)
@@ -116,25 +116,25 @@ class ObservationScaler:
 
 
 def _vectors(names: Sequence[str], dim: int, *kinds: str) -> list[int]:
-    """Columns of vectors "slotN.KIND.AXIS", axis by axis."""
+    """Columns "slotN.KIND.AXIS" of vectors, axis by axis."""
     split = [name.rpartition(".")[0] for name in names]
     found = dict.fromkeys(prefix for prefix in split if prefix.rpartition(".")[2] in kinds)
     return [names.index(f"{prefix}.{axis}") for prefix in found for axis in axis_names(dim)]
 
 
 def _own_position(env: EnvDescription) -> tuple[int, ...]:
-    """Columns of an agent's own position, axis by axis, which have to be the same for all agents."""
+    """Columns of the own position, axis by axis, which must be the same for all agents."""
     found = {
         agent: tuple(env.layouts[agent].index(f"own.{name}") for name in model.position)
         for agent, model in env.models.items()
     }
     if len(set(found.values())) > 1:
-        raise ValueError(f"own positions have to stand in the same columns for all agents; got {found}")
+        raise ValueError(f"own positions must be in the same columns for all agents; got {found}")
     return next(iter(found.values()))
 
 
 def _headings(layouts: Sequence[ObservationLayout]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Columns of the types that have a heading, and of its cosine and sine, if these are the same for all."""
+    """One-hot columns of the types with a heading, and columns of its cosine and sine if these are the same for all."""
     headed, places = set(), set()
     for layout in layouts:
         if "own.heading.cos" in layout.names:

@@ -1,4 +1,4 @@
-"""Training: Stable-Baselines3 over the vectorised environment, evaluated, saved, and continued after an end."""
+"""Training with Stable-Baselines3 on the vectorised environment: evaluation, saving and resuming."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ from agents.policy import EnvDescription, Observations, Policy, describe
 from khop_env.env.layout import Float32Array
 
 EVALUATION_SEEDS = range(20_000, 20_032)
-"""Of the episodes that decide which policy is the best; others than those that are tuned or reported on."""
+"""Seeds of the episodes that select the best policy; they differ from the seeds of tuning and reporting."""
 
-_FIRST_SEED = 1_000_000  # training episodes are drawn from generators seeded from here on
-_RUNNING = ("mean", "var", "count")  # of discounted rewards, by which training divides them
+_FIRST_SEED = 1_000_000  # training episodes are drawn from generators with seeds from here on
+_RUNNING = ("mean", "var", "count")  # statistics of the discounted return, which normalise rewards
 
-Told = Callable[[float, "Evaluation | None"], None]
-"""Called now and then with the fraction that is done, and the evaluation if there was one."""
+OnProgress = Callable[[float, "Evaluation | None"], None]
+"""Called with the completed fraction, and with the evaluation if one was made."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A point of the learning curve.
+    """One point of the learning curve.
 
     Attributes:
         timesteps: agent-steps so far.
         mean_return: over the evaluation episodes.
-        final_task_error: mean at their end over episodes and agents, in the task's unit.
-        max_normalized_disagreement: largest |xi| / rho in them.
+        final_task_error: mean over the agents and episodes at the end, in the task's unit.
+        max_normalized_disagreement: largest |xi| / rho in the episodes.
     """
 
     timesteps: int
@@ -64,13 +64,13 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Training:
-    """What a run came to.
+    """Result of a training run.
 
     Attributes:
-        policy: the best of all evaluations.
+        policy: the policy with the best evaluation.
         curve: the evaluations.
-        seconds: of wall time in `learn`, those before a resumed checkpoint included.
-        finished: whether it came to its end, and wasn't interrupted.
+        seconds: wall time of training, the time before a resumed checkpoint included.
+        finished: False if it was interrupted.
     """
 
     policy: LearnedPolicy
@@ -80,85 +80,88 @@ class Training:
 
 
 def train(
-    config: TrainingConfig, out: str | Path | None = None, *, resume: bool = False, told: Told | None = None
+    config: TrainingConfig,
+    out: str | Path | None = None,
+    *,
+    resume: bool = False,
+    on_progress: OnProgress | None = None,
 ) -> Training:
     """Train a policy.
 
-    The folder gets config.toml (every setting, as `khop train --config` takes it) and config.json (the same and library
-    versions), curve.csv, best.npz and last.npz (policies with their
-    observation scales), checkpoint.npz (all that continuing needs) and TensorBoard's logs. A keyboard interrupt saves
-    and returns. What is continued goes on as if it had not been interrupted, bit for bit with PPO; SAC begins with an
-    empty replay buffer. With more `timesteps` than before, a run goes on beyond its end, with PPO's learning rate at
-    what it is that far from the new end.
+    The folder gets config.toml (every setting, for `khop train --config`), config.json (the same, and library
+    versions), curve.csv, best.npz and last.npz (policies with their observation scales), checkpoint.npz (everything
+    needed to resume) and TensorBoard logs. A keyboard interrupt saves and returns. A resumed run continues as if it
+    had not been interrupted, bit for bit with PPO; SAC begins with an empty replay buffer. With more `timesteps`
+    than before, a run continues beyond its end; PPO's learning rate then follows the schedule of the longer run.
 
     Args:
-        config: what to train; with `resume` it has to be the one of the folder, but for larger `timesteps`.
-        out: folder; None to keep everything in memory.
-        resume: continue from the folder's checkpoint.
-        told: what to tell of the progress.
+        config: settings; with `resume` they must equal those of the folder, except that `timesteps` may be larger.
+        out: folder of the run; None to keep everything in memory.
+        resume: whether to continue from the folder's checkpoint.
+        on_progress: called with the completed fraction, and the evaluation if one was made.
 
     Raises:
-        FileNotFoundError: for `resume` without a checkpoint.
-        FileExistsError: for a folder with a run in it, without `resume`, or with one that is going on.
-        CheckpointError: for a checkpoint that can't be read.
-        ValueError: for an unknown environment or scenario, or `resume` with other settings or another environment.
+        FileNotFoundError: if `resume` is set and there is no checkpoint.
+        FileExistsError: if the folder holds a run and `resume` isn't set, or another training is running there.
+        CheckpointError: if the checkpoint can't be read.
+        ValueError: if environment or scenario is unknown, or a resumed run had other settings or another environment.
     """
-    torch.set_num_threads(1)  # networks this small don't gain from more
+    torch.set_num_threads(1)  # small networks don't gain from more
     folder = None if out is None else Path(out)
     asked, config = config, dataclasses.replace(config, scenario=chosen_scenario(config.environment, config.scenario))
     if folder is None or not (folder / CHECKPOINT).exists():
         if resume:
             raise FileNotFoundError(f"nothing to resume: there is no {CHECKPOINT} in {folder}")
         if folder is None:
-            return _Run(config, None, None, told, asked).learn()
+            return _Run(config, None, None, on_progress, asked).learn()
     with alone_in(folder):
         saved = load_checkpoint(folder, config) if resume else None
         if not resume and any((folder / name).exists() for name in (CHECKPOINT, "best.npz")):
             raise FileExistsError(f"{folder} holds a training run; continue it with --resume, or choose another folder")
-        return _Run(config, folder, saved, told, asked).learn()
+        return _Run(config, folder, saved, on_progress, asked).learn()
 
 
 class _StopError(Exception):
-    """Ctrl-C came in the middle of an update or an evaluation."""
+    """Ctrl-C during an update or an evaluation."""
 
 
 class _Run(BaseCallback):
-    """A run and its bookkeeping, as Stable-Baselines3's callback."""
+    """A training run, as a Stable-Baselines3 callback."""
 
     def __init__(
         self,
         config: TrainingConfig,
         folder: Path | None,
         saved: Mapping[str, Any] | None,
-        told: Told | None,
+        on_progress: OnProgress | None,
         asked: TrainingConfig,
     ) -> None:
         super().__init__()
         self.asked = asked  # with the scenario as the user names it
-        self.config, self.folder, self.told = config, folder, told
+        self.config, self.folder, self.on_progress = config, folder, on_progress
         self.env: VecNormalize = training_environment(config)
         self.learner: TrainingVecEnv = self.env.venv  # type: ignore[assignment]
         self.batched = batched = self.learner.batched
         self.fingerprint = fingerprint(chosen_scenario(config.environment, config.scenario), batched)
-        if saved is not None and (said := differences(saved["fingerprint"], self.fingerprint)):
+        if saved is not None and (text := differences(saved["fingerprint"], self.fingerprint)):
             raise ValueError(
-                f"{folder} holds a run in another environment: {said}; resume it with the scenario as it was, or train "
-                "in another folder"
+                f"{folder} holds a run in another environment: {text}; resume it with the unchanged scenario, or "
+                "train in another folder"
             )
-        self.judge = build(config, len(EVALUATION_SEEDS))
+        self.evaluation_env = build(config, len(EVALUATION_SEEDS))
         self.description = describe(batched)
         self.types = list(dict.fromkeys(model.type for model in batched.fleet.models))
-        layout = batched.layouts[0]  # features begin with the observation's columns
+        layout = batched.layouts[0]  # the first features are the observation's columns
         columns = [layout.index(f"own.type.{kind}") for kind in self.types]
         log = None if folder is None else str(folder / "tensorboard")
         self.interrupted, self.resumed = False, saved is not None
-        self.algorithm = make_model(config, self.env, columns, log)  # it seeds the environment, too
+        self.algorithm = make_model(config, self.env, columns, log)  # this seeds the environment as well
         self.env.seed((config.seed + 1) * _FIRST_SEED)
         self.curve: list[Evaluation] = []
         self.seconds = 0.0
         if saved is not None:
             self._restore(saved)
-        self.best = max((one.mean_return for one in self.curve), default=-np.inf)
+        self.best = max((point.mean_return for point in self.curve), default=-np.inf)
         self.policy = self._exported()
         for name in model_state(self.algorithm)["parameters"]:
             if isinstance(optimizer := attrgetter(name)(self.algorithm), torch.optim.Optimizer):
@@ -167,7 +170,7 @@ class _Run(BaseCallback):
             self._write_config(folder)
 
     def learn(self) -> Training:
-        """Train to the end, or to the interrupt."""
+        """Train to the end or until an interrupt."""
         done = self.algorithm.num_timesteps
         self.start = time.perf_counter()
         if done < self.config.timesteps:
@@ -194,16 +197,16 @@ class _Run(BaseCallback):
 
     def _on_training_start(self) -> None:
         if not self.resumed:
-            self._save()  # so that an early interrupt leaves something to go on from
+            self._save()  # so that a run can be resumed after an early interrupt
 
     def _on_step(self) -> bool:
         return not self.interrupted
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C end the training after the step that it comes in, of an episode, an update or an evaluation.
+        """Let Ctrl-C end the training after the current step of an episode, an update or an evaluation.
 
-        A second one is an exception as usual.
+        A second Ctrl-C raises KeyboardInterrupt as usual.
         """
         with contextlib.suppress(_StopError):
             if threading.current_thread() is not threading.main_thread():
@@ -225,19 +228,19 @@ class _Run(BaseCallback):
             raise _StopError
 
     def _on_rollout_start(self) -> None:
-        """Between updates: the policy is up to date, and the environment stands still."""
+        """Evaluate and save between updates, where policy and environment are consistent."""
         now, every = self.algorithm.num_timesteps, self.config.timesteps / self.config.evaluations
         if now // every > (self.curve[-1].timesteps // every if self.curve else 0):
             self._evaluate()
             self._save()
-        elif self.told is not None:
-            self.told(now / self.config.timesteps, None)
+        elif self.on_progress is not None:
+            self.on_progress(now / self.config.timesteps, None)
 
     def _evaluate(self) -> None:
         if self.curve and self.curve[-1].timesteps == self.algorithm.num_timesteps:
             return
         policy = self._exported()
-        episodes = play(self.judge, _Stoppable(policy, self), EVALUATION_SEEDS, name=self.config.algorithm)
+        episodes = play(self.evaluation_env, _Stoppable(policy, self), EVALUATION_SEEDS, name=self.config.algorithm)
         found = Evaluation(
             self.algorithm.num_timesteps,
             float(episodes.returns.mean()),
@@ -251,8 +254,8 @@ class _Run(BaseCallback):
             self.best, self.policy = found.mean_return, policy
             if self.folder is not None:
                 policy.save(self.folder / "best.npz")
-        if self.told is not None:
-            self.told(min(1.0, found.timesteps / self.config.timesteps), found)
+        if self.on_progress is not None:
+            self.on_progress(min(1.0, found.timesteps / self.config.timesteps), found)
 
     def _exported(self) -> LearnedPolicy:
         about = {
@@ -272,8 +275,8 @@ class _Run(BaseCallback):
         self._exported().save(self.folder / "last.npz")
         lines = ["timesteps,mean_return,final_task_error,max_normalized_disagreement"]
         lines += [
-            f"{one.timesteps},{one.mean_return!r},{one.final_task_error!r},{one.max_normalized_disagreement!r}"
-            for one in self.curve
+            f"{point.timesteps},{point.mean_return!r},{point.final_task_error!r},{point.max_normalized_disagreement!r}"
+            for point in self.curve
         ]
         write(self.folder / "curve.csv", "\n".join(lines) + "\n")
         write_checkpoint(self.folder / CHECKPOINT, self._checkpoint())
@@ -284,7 +287,7 @@ class _Run(BaseCallback):
         write(folder / "config.toml", write_config(self.asked, _versions()))
 
     def _checkpoint(self) -> dict[str, Any]:
-        """Everything that the next update depends on."""
+        """Everything that the next update depends on, for `write_checkpoint`."""
         return {
             "config": self.config.as_dict(),
             "fingerprint": self.fingerprint,
@@ -297,10 +300,10 @@ class _Run(BaseCallback):
         }
 
     def _restore(self, saved: Mapping[str, Any]) -> None:
-        """Bring everything into the state that was saved.
+        """Restore the saved state of model, environment and learning curve.
 
         Raises:
-            CheckpointError: for what isn't such a state.
+            CheckpointError: if `saved` isn't such a state.
         """
         try:
             self.env.reset()
@@ -308,20 +311,18 @@ class _Run(BaseCallback):
             self.learner.before = restored(self.learner.before, saved["before"], "before")
             rewards, running = saved["rewards"], self.env.ret_rms
             if not all(np.shape(rewards[name]) == () and np.isfinite(rewards[name]) for name in _RUNNING):
-                raise ValueError("the running mean of the rewards isn't finite")
+                raise ValueError("the running statistics of the rewards aren't finite")
             running.mean, running.var, running.count = (rewards[name] for name in _RUNNING)
             self.env.returns = restored(self.env.returns, rewards["returns"], "returns")
             self.curve = [restored(Evaluation(0, 0.0, 0.0, 0.0), point, "curve") for point in saved["curve"]]
             self.seconds = float(saved["seconds"])
             restore_model(self.algorithm, saved["model"])
         except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RuntimeError) as error:
-            raise CheckpointError(
-                f"{self.folder}: its {CHECKPOINT} doesn't hold what continuing needs ({error})"
-            ) from error
+            raise CheckpointError(f"{self.folder}: its {CHECKPOINT} can't be resumed ({error})") from error
 
 
 class _Stoppable:
-    """A policy that is interrupted between its actions."""
+    """A policy that can be interrupted between its actions."""
 
     def __init__(self, policy: Policy, run: _Run) -> None:
         self._policy, self._run = policy, run

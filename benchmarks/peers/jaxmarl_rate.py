@@ -1,6 +1,6 @@
 """Agent-steps per second of JaxMARL's simple_spread with 8 agents, one compiled step of the batch per call.
 
-Run in an environment with jaxmarl; XLA uses as many threads as it likes.
+Run in an environment with jaxmarl; XLA chooses its number of threads.
 """
 
 import json
@@ -21,9 +21,9 @@ _, state = jax.jit(jax.vmap(env.reset))(keys)
 
 
 def sample(key: jax.Array) -> dict[str, jax.Array]:
-    """Random actions of one copy."""
+    """Random actions of one environment."""
     several = jax.random.split(key, env.num_agents)
-    return {agent: env.action_space(agent).sample(one) for agent, one in zip(env.agents, several, strict=True)}
+    return {agent: env.action_space(agent).sample(key) for agent, key in zip(env.agents, several, strict=True)}
 
 
 pool = [jax.jit(jax.vmap(sample))(jax.random.split(jax.random.PRNGKey(seed), batch)) for seed in range(8)]

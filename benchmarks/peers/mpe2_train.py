@@ -20,11 +20,11 @@ from torch import nn
 
 timesteps = int(sys.argv[1])
 torch.set_num_threads(1)
-one = supersuit.pettingzoo_env_to_vec_env_v1(
+single = supersuit.pettingzoo_env_to_vec_env_v1(
     simple_spread_v3.parallel_env(N=8, continuous_actions=True, max_cycles=200)
 )
 env = VecNormalize(
-    supersuit.concat_vec_envs_v1(one, 64, num_cpus=0, base_class="stable_baselines3"), norm_obs=False, gamma=0.95
+    supersuit.concat_vec_envs_v1(single, 64, num_cpus=0, base_class="stable_baselines3"), norm_obs=False, gamma=0.95
 )
 model = PPO(
     "MlpPolicy",

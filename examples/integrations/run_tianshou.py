@@ -46,7 +46,7 @@ env = make()
 actor = ContinuousActorProbabilistic(preprocess_net=net(), action_shape=env.action_space.shape, unbounded=True)
 policy = ProbabilisticActorPolicy(
     actor=actor,
-    dist_fn=lambda given: Independent(Normal(*given), 1),
+    dist_fn=lambda parameters: Independent(Normal(*parameters), 1),
     action_space=env.action_space,
     action_scaling=False,  # the environment clips
     action_bound_method=None,
@@ -61,10 +61,10 @@ collected = collector.collect(n_episode=COPIES, reset_before_collect=True)
 assert collected.n_collected_steps == COPIES * CYCLES * len(env.agents), collected
 assert collected.returns.shape == (COPIES, len(env.agents)), collected
 
-before = torch.cat([one.detach().ravel() for one in actor.parameters()])
+before = torch.cat([weight.detach().ravel() for weight in actor.parameters()])
 with policy_within_training_step(team.policy):
     team.update(collector.buffer, batch_size=64, repeat=1)
-after = torch.cat([one.detach().ravel() for one in actor.parameters()])
+after = torch.cat([weight.detach().ravel() for weight in actor.parameters()])
 assert after.isfinite().all()
 assert (after != before).any()
 print(

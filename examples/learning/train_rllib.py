@@ -38,7 +38,7 @@ parser.add_argument("--per-type", action="store_true", help="one policy for each
 parser.add_argument("--iterations", type=int, default=5)
 parser.add_argument("--env-runners", type=int, default=2)
 parser.add_argument("--out", type=Path, default=Path("runs/rllib"), help="folder of the checkpoint")
-given = parser.parse_args()
+options = parser.parse_args()
 
 
 class Scaled(BaseParallelWrapper):
@@ -48,21 +48,23 @@ class Scaled(BaseParallelWrapper):
 
 
 def make(config) -> ParallelPettingZooEnv:
-    return ParallelPettingZooEnv(Scaled(import_module(f"khop_env.{given.environment}").parallel_env(**config)))
+    return ParallelPettingZooEnv(Scaled(import_module(f"khop_env.{options.environment}").parallel_env(**config)))
 
 
 def policy_of(agent, episode=None, **_) -> str:
-    return agent.rpartition("_")[0] if given.per_type else "shared"  # an id is a type and a number
+    return agent.rpartition("_")[0] if options.per_type else "shared"  # an id is a type and a number
 
 
 def rows(part) -> dict[str, np.ndarray]:
-    """All parameters of each policy in a row, of a learner or an env runner."""
+    """All parameters of each policy as one vector, of a learner or an env runner."""
     parameters = {name: part.module[name].parameters() for name in policies}
-    return {name: np.concatenate([one.detach().numpy().ravel() for one in ones]) for name, ones in parameters.items()}
+    return {
+        name: np.concatenate([each.detach().numpy().ravel() for each in group]) for name, group in parameters.items()
+    }
 
 
 def weights(algorithm) -> list[dict[str, np.ndarray]]:
-    """The learner's, and those that each env runner plays with."""
+    """Parameters of the learner, and of each env runner."""
     learner = [result.get() for result in algorithm.learner_group.foreach_learner(rows)]
     return learner + algorithm.env_runner_group.foreach_env_runner(rows)
 
@@ -77,20 +79,20 @@ def train(algorithm) -> dict:
     return result
 
 
-arguments = {"observe": given.observe, "max_cycles": CYCLES}
-if scenario := given.scenario or ("mixed_fleet" if given.per_type else None):
+arguments = {"observe": options.observe, "max_cycles": CYCLES}
+if scenario := options.scenario or ("mixed_fleet" if options.per_type else None):
     arguments["scenario"] = scenario
 policies = sorted({policy_of(agent) for agent in make(arguments).possible_agents})
 register_env("khop", make)
 torch.set_num_threads(1)
-ray.init(num_cpus=1 + given.env_runners, include_dashboard=False, logging_level=logging.ERROR, log_to_driver=False)
+ray.init(num_cpus=1 + options.env_runners, include_dashboard=False, logging_level=logging.ERROR, log_to_driver=False)
 logging.getLogger("ray.rllib").setLevel(logging.ERROR)
 config = (
     PPOConfig()
     .environment("khop", env_config=arguments)
-    # A runner with as many requests unanswered (1 by default) is sent no weights, and on a busy machine a restored
-    # algorithm would play on with random ones.
-    .env_runners(num_env_runners=given.env_runners, max_requests_in_flight_per_env_runner=10)
+    # An env runner with this many open requests (default: 1) gets no new weights; on a busy machine a restored
+    # algorithm would sample with random weights.
+    .env_runners(num_env_runners=options.env_runners, max_requests_in_flight_per_env_runner=10)
     .multi_agent(policies=set(policies), policy_mapping_fn=policy_of)
     .rl_module(model_config={"fcnet_hiddens": [64, 64]})
     .training(train_batch_size_per_learner=EPISODES * CYCLES, minibatch_size=1024, num_epochs=10)
@@ -100,24 +102,26 @@ config = (
 )
 algorithm = config.build_algo()
 fresh = weights(algorithm)[0]
-for _ in range(given.iterations):
+for _ in range(options.iterations):
     train(algorithm)
 trained = weights(algorithm)
 assert all((trained[0][name] != fresh[name]).any() for name in policies), "a policy didn't learn"
 
-# each env runner plays episodes of its own
+# each env runner has episodes of its own
 runners = algorithm.env_runner_group
-states = runners.foreach_env_runner(lambda one: one.env.envs[0].unwrapped.par_env.state(), local_env_runner=False)
-assert len(states) == len({state.tobytes() for state in states}) == given.env_runners, states
+states = runners.foreach_env_runner(lambda runner: runner.env.envs[0].unwrapped.par_env.state(), local_env_runner=False)
+assert len(states) == len({state.tobytes() for state in states}) == options.env_runners, states
 
-checkpoint = algorithm.save_to_path(given.out.resolve())
+checkpoint = algorithm.save_to_path(options.out.resolve())
 algorithm.stop()
 restored = PPO.from_checkpoint(checkpoint)
-for ours, theirs in zip(weights(restored), trained, strict=True):
-    assert all((ours[name] == theirs[name]).all() for name in policies), "the restored weights are others"
+for found, saved in zip(weights(restored), trained, strict=True):
+    assert all((found[name] == saved[name]).all() for name in policies), "the restored weights differ"
 result = train(restored)
-assert result["training_iteration"] == given.iterations + 1, result["training_iteration"]
-assert result["env_runners"]["num_env_steps_sampled_lifetime"] >= (given.iterations + 1) * EPISODES * CYCLES
+assert result["training_iteration"] == options.iterations + 1, result["training_iteration"]
+assert result["env_runners"]["num_env_steps_sampled_lifetime"] >= (options.iterations + 1) * EPISODES * CYCLES
 restored.stop()
 ray.shutdown()
-print(f"Ray {ray.__version__}: {len(policies)} policies, {given.env_runners} env runners; checkpoint in {given.out}")
+print(
+    f"Ray {ray.__version__}: {len(policies)} policies, {options.env_runners} env runners; checkpoint in {options.out}"
+)

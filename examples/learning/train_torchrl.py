@@ -1,4 +1,4 @@
-"""TorchRL: MAPPO, where agents share an actor and a critic sees what all of them see; IPPO by a flag.
+"""TorchRL: MAPPO, with a shared actor and a critic on all observations; IPPO by a flag.
 
 python -m venv .venv-torchrl
 .venv-torchrl/bin/pip install -c constraints.txt -e . 'torchrl>=0.14'
@@ -30,9 +30,9 @@ parser = argparse.ArgumentParser(description="MAPPO or IPPO by TorchRL")
 parser.add_argument("environment", nargs="?", default="consensus_v0", choices=environments())
 parser.add_argument("--scenario", help="default: the environment's own")
 parser.add_argument("--observe", default="estimate", choices=("estimate", "oracle", "local"))
-parser.add_argument("--ippo", action="store_true", help="a critic that sees what its agent sees")
+parser.add_argument("--ippo", action="store_true", help="a critic on the own observation only")
 parser.add_argument("--iterations", type=int, default=12)
-given = parser.parse_args()
+options = parser.parse_args()
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 warnings.filterwarnings("ignore", message="PettingZoo in TorchRL is tested using")
@@ -43,10 +43,10 @@ warnings.filterwarnings(
 torch.set_num_threads(1)
 torch.manual_seed(0)
 
-arguments = {"observe": given.observe, "max_cycles": CYCLES}
-if given.scenario:
-    arguments["scenario"] = given.scenario
-raw = import_module(f"khop_env.{given.environment}").parallel_env(**arguments)
+arguments = {"observe": options.observe, "max_cycles": CYCLES}
+if options.scenario:
+    arguments["scenario"] = options.scenario
+raw = import_module(f"khop_env.{options.environment}").parallel_env(**arguments)
 env = PettingZooWrapper(raw, group_map=MarlGroupMapType.ALL_IN_ONE_GROUP)
 env = TransformedEnv(env, RewardScaling(loc=0.0, scale=SCALE, in_keys=[("agents", "reward")]))
 env.set_seed(0)
@@ -71,7 +71,7 @@ actor = ProbabilisticActor(
     return_log_prob=True,
 )
 critic = TensorDictModule(
-    network(1, centralized=not given.ippo), in_keys=[("agents", "observation")], out_keys=[("agents", "state_value")]
+    network(1, centralized=not options.ippo), in_keys=[("agents", "observation")], out_keys=[("agents", "state_value")]
 )
 loss = ClipPPOLoss(actor, critic, entropy_coeff=1e-3, normalize_advantage=True)
 loss.set_keys(
@@ -85,7 +85,7 @@ loss.set_keys(
 loss.make_value_estimator(gamma=GAMMA, lmbda=0.95)
 optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
 steps = CYCLES * EPISODES
-collector = Collector(env, actor, frames_per_batch=steps, total_frames=steps * given.iterations)
+collector = Collector(env, actor, frames_per_batch=steps, total_frames=steps * options.iterations)
 
 returns = []
 for data in collector:
@@ -109,6 +109,6 @@ for data in collector:
             torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
             optimiser.step()
 collector.shutdown()
-assert given.iterations == 1 or returns[-1] > returns[0], "no progress"
-name = "IPPO" if given.ippo else "MAPPO"
+assert options.iterations == 1 or returns[-1] > returns[0], "no progress"
+name = "IPPO" if options.ippo else "MAPPO"
 print(f"TorchRL {torchrl.__version__}: {name} of {agents} agents, mean return {returns[0]:.1f} to {returns[-1]:.1f}")

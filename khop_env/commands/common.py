@@ -94,7 +94,7 @@ def load(name: str) -> Scenario:
     Raises:
         ValueError: if there is no such scenario, file, object or law.
     """
-    from agents import LAWS, LawError, make_law
+    from agents.laws import LAWS, LawError, make_law
     from khop_env.registry import scenario
     from khop_env.scenarios.files import read_scenario
 

@@ -22,6 +22,7 @@ from khop_env.commands.common import (
     print_json,
 )
 from khop_env.commands.folders import folder_name
+from khop_env.extras import how_to_install
 from khop_env.terminal import Progress, print_text, say, waiting
 
 if TYPE_CHECKING:
@@ -109,7 +110,7 @@ def train(
         try:
             from agents.learning.training import train
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(f"training needs {error.name}: pip install 'khop_env[rl]'") from error
+            raise ModuleNotFoundError(f"training needs {error.name}: {how_to_install('rl')}") from error
         from agents.learning.environment import build
         from agents.policy import describe
 
@@ -129,7 +130,7 @@ def train(
                     f"{evaluation.final_task_error:.3f} {unit}, |e| {evaluation.max_normalized_disagreement:.3f}"
                 )
 
-        training = train(chosen, folder, resume=resume, told=report)
+        training = train(chosen, folder, resume=resume, on_progress=report)
     best = max((each.mean_return for each in training.curve), default=None)
     files = {"best": folder / "best.npz", "last": folder / "last.npz"}
     files |= {"config": folder / "config.toml", "curve": folder / "curve.csv"}

@@ -1,4 +1,4 @@
-"""THE API: the same numbers as PettingZoo, Gymnasium and Stable-Baselines3 want them."""
+"""Environments: PettingZoo, Gymnasium and Stable-Baselines3 interfaces to one batched environment."""
 
 from khop_env.env.actuators import ACTUATORS, Actuator, Direct, Hold, Lag, SlewLimit
 from khop_env.env.batched import BatchedEnv

@@ -1,4 +1,4 @@
-"""From actions to commanded inputs: which entry of a flat action is which agent's input, checks and clipping."""
+"""From actions to commanded inputs: the agents' entries in a flat action, checks and clipping."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ class ActionReader:
 
         Args:
             actions: (B, N, m) or (B, A).
-            command: overwritten, where an acting agent has an input; or left alone if this raises.
+            command: (m, B) overwritten in the rows of acting agents; unchanged if this raises.
 
         Returns:
-            (B, N) how many entries of each agent's action were clipped.
+            (B, N) number of clipped entries of each agent's action.
 
         Raises:
             ValueError: for actions of a wrong shape or not finite.
@@ -78,7 +78,7 @@ class ActionReader:
         if bad >= 0:
             env, number = divmod(bad, len(self._entry))
             owner = self._owner[number]
-            where = f" in copy {env}" if self._num_envs > 1 else ""
+            where = f" in environment {env}" if self._num_envs > 1 else ""
             raise ValueError(
                 f"the action of {self._agents[owner]!r}{where} isn't finite: entry "
                 f"{self._entry[number] - self.offset[owner]} is {flat[env, self._entry[number]]}"
@@ -90,18 +90,18 @@ class ActionReader:
 def read_actions(
     actions: FloatArray, entry: IntArray, column: IntArray, owner: IntArray, command: FloatArray, clipped: IntArray
 ) -> int:
-    """Clip actions to [-1, 1] and write them into `command` (m, B); count what was clipped.
+    """Clip actions to [-1, 1] and write them into `command` (m, B); count the clipped entries.
 
     Args:
         actions: (B, A) all agents' actions of each environment, side by side.
         entry: (C,) which entry of an environment's actions is read.
         column: (C,) the input it becomes.
-        owner: (C,) number of the agent whose it is.
+        owner: (C,) number of the agent that it belongs to.
         command: (m, B) overwritten at `column`.
         clipped: (B, N) added to.
 
     Returns:
-        -1, or where the first action is that isn't finite: environment * C + place in `entry`. Nothing is written then.
+        -1, or environment * C + index in `entry` of the first action that isn't finite; nothing is written then.
     """
     for env in range(actions.shape[0]):
         for q in range(entry.size):

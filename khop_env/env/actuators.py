@@ -1,6 +1,6 @@
-"""Between an action and the input: what keeps the derivative of g bounded where a policy's actions jump.
+"""Actuators: from actions to inputs, with a bounded derivative of g where a policy's actions jump.
 
-The input observer's theorem asks for inputs with a bounded derivative (Assumption 2-ii of the paper). A policy changes
+The input observer's theorem requires inputs with a bounded derivative (Assumption 2-ii of the paper). A policy changes
 its action once in a control period, by any amount, so with `Direct` only the state observer's theorem holds; the others
 limit how fast the inputs change. Inputs are fractions of the input limits here.
 """
@@ -56,7 +56,7 @@ class Lag(Actuator):
         _require_positive(self, "time_constant")
 
     def __call__(self, command: FloatArray, u: FloatArray, dt: float, step: int, steps: int) -> FloatArray:
-        """Where the lag ends after the step."""
+        """Output of the lag after the step."""
         return u - math.expm1(-dt / self.time_constant) * (command - u)
 
 
@@ -92,10 +92,10 @@ ACTUATORS: dict[str, type[Actuator]] = {"direct": Direct, "lag": Lag, "slew": Sl
 
 
 def as_actuator(actuator: str | Actuator) -> Actuator:
-    """An actuator by name with its default parameters, or the one given.
+    """An actuator from its name, with default parameters; an `Actuator` is returned as it is.
 
     Raises:
-        ValueError: for an unknown name, or something else.
+        ValueError: for an unknown name, or an object that isn't an `Actuator`.
     """
     if not isinstance(actuator, str):
         if not callable(actuator) or isinstance(actuator, type):
@@ -103,14 +103,14 @@ def as_actuator(actuator: str | Actuator) -> Actuator:
         return actuator
     if actuator not in ACTUATORS:
         raise ValueError(
-            f"no actuator {actuator!r}; {did_you_mean(actuator, ACTUATORS)} (or give one, e.g. Lag(time_constant=0.2))"
+            f"no actuator {actuator!r}; {did_you_mean(actuator, ACTUATORS)} (or an object, e.g. Lag(time_constant=0.2))"
         )
     return ACTUATORS[actuator]()
 
 
-def described(actuator: Actuator) -> str:
-    """What is the same for equal actuators: the class, and the parameters of one that is a dataclass."""
-    return repr(actuator) if is_dataclass(actuator) else type(actuator).__name__
+def described(part: object) -> str:
+    """Text that is the same for equal actuators, disturbances or bounds: the class, and a dataclass's parameters."""
+    return repr(part) if is_dataclass(part) else type(part).__name__
 
 
 def _require_positive(actuator: Actuator, name: str) -> None:

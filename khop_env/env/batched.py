@@ -1,4 +1,4 @@
-"""B copies of one environment as arrays: what the PettingZoo, Gymnasium and SB3 classes are made of."""
+"""A batch of environments as arrays, on which the PettingZoo, Gymnasium and SB3 classes are built."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from khop_env.brief import spread
 from khop_env.env.actions import ActionReader
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.layout import Float32Array, ObservationLayout
@@ -23,28 +24,28 @@ from khop_env.tasks import Outcome, Task, World
 
 
 class BatchedEnv:
-    """B copies of a fleet with its observers and a task, stepped together in compiled code.
+    """B environments, each a fleet with its observers and a task, stepped together in compiled code.
 
-    Arrays are (B, N, ...): copies, then agents; observations and actions (B, N, D) and (B, N, m) where they are
+    Arrays are (B, N, ...): environments, then agents; observations and actions (B, N, D) and (B, N, m) where they are
     uniform, otherwise (B, sum of D_i) and (B, sum of m_i), agents side by side. There is no autoreset:
-    `reset(env_ids=...)` those that ended.
+    `reset(env_ids=...)` the environments that ended.
 
     Args:
-        simulator: B copies, without a law, built with a task graph.
-        task: who acts, rewards, when it is over, and additional columns of observations.
-        settings: everything else.
-        scenario: name of the scenario that it was assembled from.
+        simulator: of B environments, without a law, built with a task graph.
+        task: acting agents, rewards, termination, and additional columns of observations.
+        settings: all other arguments.
+        scenario: name of the scenario that the simulator was built from.
 
     Attributes:
         task: this environment's own copy, bound to the fleet.
-        world: what the task sees.
+        world: the true state, as an argument of the task's methods.
         agents: ids of the N agents that act.
         fleet: all agents.
-        num_envs: number of copies B.
-        layouts: per agent what its observation holds.
+        num_envs: number of environments B.
+        layouts: names, units and bounds of the columns of each agent's observation.
         observation_offset: (N + 1,) where each agent's columns begin in the flat observation.
         action_offset: (N + 1,) where each agent's entries begin in the flat action.
-        state_fields: what `state` holds.
+        state_fields: names, units and bounds of the columns of `state`.
 
     Raises:
         ValueError: for acting agents whose inputs have no limit, or a task edge to an agent more than k hops away.
@@ -103,6 +104,14 @@ class BatchedEnv:
         self._seeded = np.zeros(self.num_envs, bool)
         self._clipped_actions = np.zeros((self.num_envs, len(members)), np.int64)
 
+    def __str__(self) -> str:
+        act = "" if len(self.agents) == len(self.fleet) else f", of which {len(self.agents)} act"
+        made = f"{self.task.environment} on {self.scenario!r}{act}: {self.simulator.design}"
+        return f"{made}; observe={self.settings.observe!r}, num_envs={self.num_envs}, {spread(self.world.t)}"
+
+    def __repr__(self) -> str:
+        return f"BatchedEnv({self})"
+
     # -- the episode ---------------------------------------------------------------------------------------------
 
     def reset(
@@ -111,31 +120,31 @@ class BatchedEnv:
         env_ids: Sequence[int] | IntArray | None = None,
         initial_states: ArrayLike | None = None,
     ) -> tuple[Float32Array, Infos]:
-        """Start a new episode in all copies, or in some.
+        """Start a new episode in all environments, or in some.
 
         Args:
-            seed: copy b starts from seed + b, or from one seed per copy that is reset. Without a seed a copy goes on
-                drawing from the generator that it was seeded with; one that never was draws fresh entropy.
-            env_ids: (R,) indices of the copies to reset; all by default.
-            initial_states: (n,) or (R, n) states of all agents, those that don't act included; nan is drawn.
+            seed: environment b starts from seed + b, or from one seed per environment that is reset. Without a seed an
+                environment goes on with its generator; if it never was seeded, it draws fresh entropy.
+            env_ids: (R,) indices of the environments to reset; all by default.
+            initial_states: (n,) or (R, n) states of all agents, leaders included; nan where they are drawn.
 
         Returns:
-            Observations and infos of all copies.
+            Observations and infos of all environments.
 
         Raises:
             ValueError: for a seed that isn't a non-negative integer, not R of them, or initial states of a wrong shape
                 or infinite; nothing has been reset then.
-            DesignError: for initial states that the observers can't start from; likewise.
+            DesignError: for initial states outside the funnels; likewise.
         """
         chosen = self.simulator.env_list(env_ids)
         chosen_seeds = seeds(seed, chosen)
-        generators = [self._generator(int(b), each) for b, each in zip(chosen, chosen_seeds, strict=True)]
+        generators = [self._generator(int(b), own) for b, own in zip(chosen, chosen_seeds, strict=True)]
         if initial_states is not None:
             initial_states = self._completed(np.asarray(initial_states, dtype=float), generators)
         self.simulator.reset(generators, initial_states, chosen)
-        for b, each, generator in zip(chosen.tolist(), chosen_seeds, generators, strict=True):
+        for b, own, generator in zip(chosen.tolist(), chosen_seeds, generators, strict=True):
             self._generators[b] = generator
-            self._seeded[b] |= each is not None
+            self._seeded[b] |= own is not None
         self.world.inputs[:, chosen] = 0.0
         self._cycles[chosen] = 0
         self._over[chosen] = False
@@ -144,18 +153,18 @@ class BatchedEnv:
         return self._observed(self._evaluate())
 
     def step(self, actions: ArrayLike, ended: NDArray[np.bool_] | None = None) -> Step:
-        """Advance all copies by one control period.
+        """Advance all environments by one control period.
 
         Args:
-            actions: (B, N, m) or (B, A), in [-1, 1]; what is outside is clipped, padded entries are ignored.
-            ended: (B,) copies whose episode may be over already. They are stepped with the others, what is returned for
-                them means nothing, and the caller resets them.
+            actions: (B, N, m) or (B, A); clipped to [-1, 1], padded entries are ignored.
+            ended: (B,) environments whose episode may be over already. They are stepped with the others, their results
+                are meaningless, and the caller resets them.
 
         Returns:
             Observations, rewards (B, N), terminated (B,), truncated (B,), infos (arrays (B, N)).
 
         Raises:
-            ValueError: for actions of a wrong shape or not finite, or a copy whose episode is over; nothing has
+            ValueError: for actions of a wrong shape or not finite, or an environment whose episode is over; nothing has
                 changed.
             SolveError: if a state becomes infinite.
         """
@@ -172,21 +181,21 @@ class BatchedEnv:
         return observations, outcome.reward, outcome.terminated, truncated, infos
 
     def observations(self) -> Float32Array:
-        """What the agents observe now, in new memory."""
+        """Observations at the present time, in new memory."""
         return self._observe()[0]
 
     @property
     def over(self) -> NDArray[np.bool_]:
-        """(B,) whether a copy's episode has ended, or none has begun."""
+        """(B,) True where the episode has ended, or none has begun."""
         return self._over.copy()
 
     @property
     def begun(self) -> NDArray[np.bool_]:
-        """(B,) whether a copy was ever reset."""
+        """(B,) True where the environment has been reset at least once."""
         return np.array([generator is not None for generator in self._generators])
 
     def task_errors(self) -> FloatArray:
-        """(B, N) each agent's task error now, in the task's unit."""
+        """(B, N) each agent's present task error, in the task's unit."""
         return self._evaluate().infos["task_error"]
 
     def state(self) -> Float32Array:
@@ -210,8 +219,8 @@ class BatchedEnv:
         """Continue from `get_state()`'s result, which stays as it is.
 
         Raises:
-            TypeError: if it isn't one; nothing has changed then.
-            ValueError: if it is of an environment of another task, actuator or size, saying what differs; likewise.
+            TypeError: if it isn't an `EnvState`; nothing has changed then.
+            ValueError: if it is of an environment of another task, actuator or size, naming the difference; likewise.
         """
         if not isinstance(state, EnvState):
             raise TypeError(
@@ -234,23 +243,25 @@ class BatchedEnv:
 
     def _generator(self, b: int, seed: int | None) -> np.random.Generator:
         own = self._generators[b]
-        if seed is not None or own is None or not self._seeded[b]:  # an unseeded copy mustn't repeat what it inherited
+        if (
+            seed is not None or own is None or not self._seeded[b]
+        ):  # an unseeded one must not repeat draws of the environment it was copied from
             return np.random.default_rng(seed)
         return own
 
     def _completed(self, x0: FloatArray, generators: Sequence[np.random.Generator]) -> FloatArray:
-        """Initial states with what the simulator would draw in place of nan."""
+        """Initial states in which nan is replaced by the simulator's draws."""
         if not np.isnan(x0).any() or x0.shape[-1:] != (self.fleet.n,):
             return x0
-        drawn = np.array([self.simulator.initial.draw(copy.deepcopy(each)) for each in generators])
+        drawn = np.array([self.simulator.initial.draw(copy.deepcopy(rng)) for rng in generators])
         return np.where(np.isnan(x0), drawn, x0)
 
     def _require_running(self, ended: NDArray[np.bool_] | None) -> None:
         over = np.flatnonzero(self._over if ended is None else self._over & ~ended)
         if over.size:
             raise ValueError(
-                f"no episode is running in {len(over)} of {self.num_envs} copies, the first {over[0]}: call reset() "
-                "first"
+                f"no episode is running in {len(over)} of {self.num_envs} environments, the first {over[0]}: call "
+                "reset() first"
             )
 
     def _advance(self, number: int) -> None:
@@ -269,7 +280,7 @@ class BatchedEnv:
         return self.task.evaluate(self.world)
 
     def _observe(self) -> tuple[Float32Array, IntArray]:
-        """Observations, and how many entries of each agent's were clipped."""
+        """Observations, and the number of clipped entries of each agent's."""
         sources, clipped = self._sources, np.zeros((self.num_envs, len(self.agents)), np.int64)
         if sources.bound.size:
             self.simulator.observers.bound(self.simulator.state, sources.bound)
@@ -282,14 +293,16 @@ class BatchedEnv:
 
     def _observed(self, outcome: Outcome) -> tuple[Float32Array, Infos]:
         observations, clipped = self._observe()
-        seen, shape = self.simulator.extremes, (self.num_envs, len(self.agents))
-        ratios = {
-            "max_normalized_disagreement": np.maximum(seen.normalized, seen.input_normalized),
-            "max_error_to_bound": np.maximum(seen.relative, seen.input_relative),
-        }
+        extremes = self.simulator.running_extremes
         return observations, {
             **outcome.infos,
-            **{name: np.broadcast_to(values[:, None], shape).copy() for name, values in ratios.items()},
+            "max_normalized_disagreement": self._for_all(extremes.normalized, extremes.input_normalized),
+            "max_error_to_bound": self._for_all(extremes.relative, extremes.input_relative),
             "clipped_observations": clipped,
             "clipped_actions": self._clipped_actions.copy(),
         }
+
+    def _for_all(self, of_states: FloatArray, of_inputs: FloatArray) -> FloatArray:
+        """(B, N) the larger of two ratios (B,), the same for all agents of an environment."""
+        out = np.empty((self.num_envs, len(self.agents)))
+        return np.maximum(of_states[:, None], of_inputs[:, None], out=out)

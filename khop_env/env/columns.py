@@ -1,4 +1,4 @@
-"""Which columns observations and the global state have: what a layout names is what a readout reads."""
+"""Columns of observations and of the global state, for layouts and readouts alike."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class ObservationColumns:
 
     Args:
         world: fleet and observers.
-        task: bound; its edges order the slots, and it adds columns of its own.
+        task: bound to the fleet; its edges order the slots, and it may add columns.
         agents: the agents that observe, by index.
-        observe: what stands in the slots of agents out of earshot: their estimate, the truth, or nothing.
+        observe: content of the slots of k-hop targets: their estimates, their true states, or zeros.
         bounds: whether slots hold the guaranteed bound on the estimate's error.
-        uniform: the same columns for every agent, padded; or exactly what each agent has.
-        inputs: whether an agent sees its input in force: where an actuator makes it a state of its own.
+        uniform: True for the same columns for every agent, padded; False for each agent's own columns.
+        inputs: whether an agent observes its input in force, which an actuator may make a state.
 
     Attributes:
         layouts: one per agent.
@@ -75,21 +75,21 @@ class ObservationColumns:
 
         slots = slots_of(design, task.edges, agents)
         columns = [
-            self._own(i) + [one for number, slot in enumerate(mine) for one in self._slot(i, number, slot)]
-            for i, mine in zip(agents, slots, strict=True)
+            self._own(i) + [column for number, slot in enumerate(its_slots) for column in self._slot(i, number, slot)]
+            for i, its_slots in zip(agents, slots, strict=True)
         ]
         if uniform:
             self._require_equal_counts(agents)
-            columns = self._padded(columns, [len(mine) for mine in slots])
+            columns = self._padded(columns, [len(its_slots) for its_slots in slots])
         self.layouts = [
-            ObservationLayout(self._fleet.ids[i], [one.field for one in mine], its_slots)
-            for i, mine, its_slots in zip(agents, columns, slots, strict=True)
+            ObservationLayout(self._fleet.ids[i], [column.field for column in its_columns], its_slots)
+            for i, its_columns, its_slots in zip(agents, columns, slots, strict=True)
         ]
         self.readout = Readout(
-            [one for mine in columns for one in mine],
-            [number for number, mine in enumerate(columns) for _ in mine],
+            [column for its_columns in columns for column in its_columns],
+            [number for number, its_columns in enumerate(columns) for _ in its_columns],
         )
-        self.offset: IntArray = np.concatenate([[0], np.cumsum([len(mine) for mine in columns])])
+        self.offset: IntArray = np.concatenate([[0], np.cumsum([len(its_columns) for its_columns in columns])])
 
     def _own(self, i: int) -> list[Column]:
         model, first = self._fleet.models[i], int(self._fleet.input_offset[i])
@@ -105,7 +105,7 @@ class ObservationColumns:
         return columns + [_from_task("", column) for column in self._task.columns(self._world, i)]
 
     def _require_equal_counts(self, agents: Sequence[int]) -> None:
-        """Refuse a task that shows its agents different numbers of columns, where observations are uniform."""
+        """Refuse a task with different numbers of columns for different agents, where observations are uniform."""
         counts = {self._fleet.ids[i]: len(self._task.columns(self._world, i)) for i in agents}
         if len(set(counts.values())) > 1:
             few, many = min(counts, key=counts.__getitem__), max(counts, key=counts.__getitem__)
@@ -141,17 +141,18 @@ class ObservationColumns:
             for axis, feature, own in zip(self._axes, position, fleet.position_index[i], strict=True)
         ]
         columns += [
-            _state(name, one, (_ESTIMATE if estimated else _STATE)[one.how], origin, self._limit) for one in rest
+            _state(name, feature, (_ESTIMATE if estimated else _STATE)[feature.how], origin, self._limit)
+            for feature in rest
         ]
         columns += self._padding(name, self._most_rest - len(rest))
         if self._bounds:
             columns += self._bound_columns(i, name, slot)
         if self._observe == "local" and not slot.heard:
-            return [Column(one.field) for one in columns]
+            return [Column(column.field) for column in columns]
         return columns
 
     def _bound_columns(self, i: int, name: str, slot: Slot) -> list[Column]:
-        """Bounds in the order of the state: position, then the rest; heard agents have no error."""
+        """Bounds in the order of the state: position, then the rest; 0 for neighbours, whose states are received."""
         model = self._fleet.models[slot.agent]
         states, position = list(model.states.items()), model.position_index.tolist()
         columns = []
@@ -165,29 +166,34 @@ class ObservationColumns:
         return columns + self._padding(f"{name}.bound", self._most_states - model.n)
 
     def _type(self, name: str, kind: str) -> list[Column]:
-        return [_flag(f"{name}.type.{one}", one == kind) for one in self._types] if self._uniform else []
+        return [_flag(f"{name}.type.{known}", known == kind) for known in self._types] if self._uniform else []
 
     def _padding(self, name: str, count: int) -> list[Column]:
         return [_zero(f"{name}.padding{q}") for q in range(count if self._uniform else 0)]
 
     def _padded(self, columns: list[list[Column]], slots: list[int]) -> list[list[Column]]:
-        """As many slots for every agent, and one Box."""
+        """Columns padded to equally many slots for every agent, with common bounds: one Box."""
         width, most = max(map(len, columns)), max(slots)
-        for mine, count in zip(columns, slots, strict=True):
-            slot_width = (width - len(mine)) // max(most - count, 1)
+        for its_columns, count in zip(columns, slots, strict=True):
+            slot_width = (width - len(its_columns)) // max(most - count, 1)
             for number in range(count, most):
                 name = f"slot{number}"
-                mine += [_flag(f"{name}.valid", False), *self._padding(name, slot_width - 1)]
-        low = np.min([[one.field.low for one in mine] for mine in columns], axis=0)
-        high = np.max([[one.field.high for one in mine] for mine in columns], axis=0)
+                its_columns += [_flag(f"{name}.valid", False), *self._padding(name, slot_width - 1)]
+        low = np.min([[column.field.low for column in its_columns] for its_columns in columns], axis=0)
+        high = np.max([[column.field.high for column in its_columns] for its_columns in columns], axis=0)
         return [
             [
                 Column(
-                    Field(one.field.name, one.field.unit, a, b), one.kind, one.row, one.origin, one.value, one.bounds
+                    Field(column.field.name, column.field.unit, a, b),
+                    column.kind,
+                    column.row,
+                    column.origin,
+                    column.value,
+                    column.bounds,
                 )
-                for one, a, b in zip(mine, low.tolist(), high.tolist(), strict=True)
+                for column, a, b in zip(its_columns, low.tolist(), high.tolist(), strict=True)
             ]
-            for mine in columns
+            for its_columns in columns
         ]
 
 
@@ -195,18 +201,18 @@ def state_columns(fleet: Fleet, i: int, name: str, limit: float) -> list[Column]
     """Agent i's own state: its position, then the rest; angles as cosine and sine."""
     position, rest = features(fleet.models[i])
     origin = int(fleet.state_offset[i])
-    return [_state(name, one, _STATE[one.how], origin, limit) for one in [*position, *rest]]
+    return [_state(name, feature, _STATE[feature.how], origin, limit) for feature in [*position, *rest]]
 
 
 def global_state(fleet: Fleet, limit: float, inputs: bool) -> tuple[list[Field], Readout]:
-    """The true state of all agents, leaders included, one after the other; with their inputs where these are states."""
-    columns = [one for i, name in enumerate(fleet.ids) for one in state_columns(fleet, i, name, limit)]
+    """Columns of the true state of all agents, leaders included, in order; with their inputs where these are states."""
+    columns = [column for i, name in enumerate(fleet.ids) for column in state_columns(fleet, i, name, limit)]
     if inputs:
         columns += [
             Column(Field(f"{agent}.input.{name}", "of its limit", -1.0, 1.0), INPUT, c)
             for c, (agent, name, _) in enumerate(fleet.input_names())
         ]
-    return [one.field for one in columns], Readout(columns, [0] * len(columns))
+    return [column.field for column in columns], Readout(columns, [0] * len(columns))
 
 
 def _state(name: str, feature: Feature, kind: int, origin: int, limit: float) -> Column:

@@ -1,4 +1,4 @@
-"""The centralised view: one Gymnasium agent that observes and moves the whole team."""
+"""The centralised single-agent environment: one Gymnasium agent that observes and moves the whole team."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ _AGGREGATES: dict[str, Callable[..., Any]] = {
     "clipped_observations": np.sum,
     "clipped_actions": np.sum,
 }
-"""How a team's infos are made of its agents'; others are means."""
+"""Aggregation of the agents' infos into the team's; others are means."""
 
 
 class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
     """All agents' observations side by side, all their actions side by side, and the mean of their rewards.
 
-    Infos hold the largest ratios, the sums of the clip counts, and the means of everything else.
+    Infos hold the largest ratios, the sums of the clip counts, and the means of all other values.
 
     Args:
-        env: the ParallelEnv that is seen as one.
+        env: the ParallelEnv.
 
     Attributes:
-        env: that environment; `env.layout(agent)` and `env.batched.observation_offset` say what an observation holds.
+        env: the ParallelEnv; `env.layout(agent)` names the columns of an agent's observation, and
+            `env.batched.observation_offset` is where they begin.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012
@@ -45,6 +46,12 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         low, high = (np.concatenate([getattr(layout, end) for layout in layouts]) for end in ("low", "high"))
         self.observation_space = Box(low, high, dtype=np.float32)
         self.action_space = Box(-1.0, 1.0, (int(env.batched.action_offset[-1]),), np.float32)
+
+    def __repr__(self) -> str:
+        return f"JointEnv({self.env.batched})"
+
+    def __str__(self) -> str:
+        return repr(self)  # Gymnasium's own says nothing
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -70,10 +77,10 @@ class JointEnv(gymnasium.Env[Float32Array, Float32Array]):
         Raises:
             ValueError: if no episode is running, or for an action of a wrong shape or not finite.
         """
-        given = np.asarray(action)
-        if given.shape != self.action_space.shape:
-            raise ValueError(f"the action must have shape {self.action_space.shape}; got {given.shape}")
-        observations, reward, terminated, truncated, infos = self.env.batched.step(given[None])
+        values = np.asarray(action)
+        if values.shape != self.action_space.shape:
+            raise ValueError(f"the action must have shape {self.action_space.shape}; got {values.shape}")
+        observations, reward, terminated, truncated, infos = self.env.batched.step(values[None])
         self.env.follow()
         info = self._info(infos)
         return observations.reshape(-1), float(reward.mean()), bool(terminated[0]), bool(truncated[0]), info

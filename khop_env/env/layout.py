@@ -1,6 +1,6 @@
-"""What stands where in an observation: the only place that knows; everybody else asks for fields by name.
+"""Layout of observations: fields by name, so that no other code depends on the order of columns.
 
-An agent's observation is its own state and one list of slots, a slot for each agent that it hears or estimates, ordered
+An agent's observation is its own state and one list of slots, a slot for each neighbour and each k-hop target, ordered
 by relevance to its task: task edges first, then hop distance, then index.
 """
 
@@ -38,12 +38,12 @@ class Field:
 
 @dataclass(frozen=True)
 class Slot:
-    """What is fixed of one other agent that an agent knows of.
+    """Constant properties of another agent within k hops.
 
     Attributes:
         agent: its index in the fleet.
         id: its id.
-        heard: whether it is heard (1 hop), or estimated.
+        heard: whether it is a neighbour (1 hop), whose state is received; otherwise its state is estimated.
         hops: distance in the communication graph.
         task_edge: whether the observing agent's task has an edge to it.
     """
@@ -67,7 +67,7 @@ class ObservationLayout:
     Args:
         agent: the observing agent's id.
         fields: one per column.
-        slots: what its slots are about, in their order; slots after these are padding, and all zero.
+        slots: its slots in order; further slots are padding, and all zero.
     """
 
     def __init__(self, agent: str, fields: Sequence[Field], slots: Sequence[Slot]) -> None:
@@ -103,7 +103,7 @@ class ObservationLayout:
         """The column of a field.
 
         Raises:
-            KeyError: naming the nearest field.
+            KeyError: if there is no such field; the message suggests the closest name.
         """
         if name not in self._place:
             raise KeyError(f"{self.agent!r} has no field {name!r}; {did_you_mean(name, self.names)}")
@@ -113,7 +113,7 @@ class ObservationLayout:
         """The columns of a field, or of all fields below it: "slot0.position" has one per axis.
 
         Raises:
-            KeyError: if there is none, naming the nearest field.
+            KeyError: if there is no such field; the message suggests the closest name.
         """
         found = [q for q, name in enumerate(self.names) if name == prefix or name.startswith(prefix + ".")]
         return np.array(found or [self.index(prefix)], np.int64)
@@ -124,10 +124,10 @@ class ObservationLayout:
         Raises:
             ValueError: if the last axis isn't D long.
         """
-        given = np.asarray(observation)
-        if given.shape[-1:] != (len(self),):
-            raise ValueError(f"observations of {self.agent!r} have {len(self)} columns; got shape {given.shape}")
-        return {name: given[..., column] for column, name in enumerate(self.names)}
+        values = np.asarray(observation)
+        if values.shape[-1:] != (len(self),):
+            raise ValueError(f"observations of {self.agent!r} have {len(self)} columns; got shape {values.shape}")
+        return {name: values[..., column] for column, name in enumerate(self.names)}
 
     def build(self, values: Mapping[str, ArrayLike]) -> Float32Array:
         """Observations (..., D) from values by name, which are broadcast against each other.
@@ -145,7 +145,7 @@ class ObservationLayout:
 
 @dataclass(frozen=True)
 class Feature:
-    """How a state component appears: as it stands, or an angle as its cosine and sine.
+    """Representation of a state component in observations: its value, or the cosine or sine of an angle.
 
     Attributes:
         name: of the field.
@@ -175,11 +175,11 @@ def features(model: AgentModel) -> tuple[list[Feature], list[Feature]]:
 
 
 def slots_of(design: ObserverDesign, edges: IntArray, agents: Sequence[int]) -> list[list[Slot]]:
-    """The slots of each of `agents`: everybody within k hops, in order of relevance.
+    """The slots of each of `agents`: all agents within k hops, in order of relevance.
 
     Args:
-        design: who receives from whom, and k.
-        edges: (E, 2) task edges (i, j): j matters to i.
+        design: the observers, with the communication graph and k.
+        edges: (E, 2) task edges (i, j): agent i's task depends on agent j.
         agents: the observing agents.
 
     Raises:
@@ -192,7 +192,7 @@ def slots_of(design: ObserverDesign, edges: IntArray, agents: Sequence[int]) -> 
         if j not in hops[i]:
             raise ValueError(
                 f"{design.fleet.ids[i]!r} has a task edge to {design.fleet.ids[j]!r}, which is more than "
-                f"k = {design.k} hops away, so that it knows nothing of it"
+                f"k = {design.k} hops away, so that it isn't estimated"
             )
     return [
         [

@@ -1,4 +1,4 @@
-"""What `reset` takes, checked."""
+"""Checks of the arguments of `reset`."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from khop_env.physics import Fleet, did_you_mean
 RESET_OPTIONS = ("initial_state",)
 
 
-def seeds(seed: int | Sequence[int | None] | None, copies: IntArray) -> list[int | None]:
-    """A seed, or none, for each of the copies that are reset.
+def seeds(seed: int | Sequence[int | None] | None, env_ids: IntArray) -> list[int | None]:
+    """A seed, or None, for each of the environments that are reset.
 
     Args:
-        seed: copy b gets seed + b; or one per copy.
-        copies: (R,) their numbers.
+        seed: environment b gets seed + b; or one seed per environment that is reset.
+        env_ids: (R,) their indices.
 
     Raises:
         ValueError: for a seed that isn't a non-negative integer, or not R of them.
     """
-    given = list(seed) if isinstance(seed, Iterable) else [seed]
-    for one in given:
-        if one is not None and not (isinstance(one, int | np.integer) and one >= 0):
-            raise ValueError(f"a seed must be a non-negative integer, or None; got {one!r}")
+    values = list(seed) if isinstance(seed, Iterable) else [seed]
+    for value in values:
+        if value is not None and not (isinstance(value, int | np.integer) and value >= 0):
+            raise ValueError(f"a seed must be a non-negative integer, or None; got {value!r}")
     if not isinstance(seed, Iterable):
-        return [None if seed is None else int(seed) + b for b in copies.tolist()]
-    if len(given) != len(copies):
-        raise ValueError(f"expected one seed or {len(copies)}, one per copy that is reset; got {len(given)}")
-    return given
+        return [None if seed is None else int(seed) + b for b in env_ids.tolist()]
+    if len(values) != len(env_ids):
+        raise ValueError(f"expected one seed or {len(env_ids)}, one per environment that is reset; got {len(values)}")
+    return values
 
 
 def reset_options(options: Mapping[str, Any] | None) -> Mapping[str, Any]:
@@ -51,12 +51,12 @@ def reset_options(options: Mapping[str, Any] | None) -> Mapping[str, Any]:
 
 
 def initial_states(fleet: Fleet, options: Mapping[str, Any] | None) -> FloatArray | None:
-    """Initial states from `options`; others are drawn.
+    """Initial states from `options`; nan where they are drawn.
 
         reset(options={"initial_state": {"cart_0": [0.0, 0.0, 1.0, 0.0]}})
-        reset(options={"initial_state": x0})      # (n,) the whole fleet's, or (copies, n)
+        reset(options={"initial_state": x0})      # (n,) of the whole fleet, or (num_envs, n)
 
-    Unknown options are ignored with a warning, as PettingZoo's own tests ask for.
+    Unknown options are ignored with a warning, as PettingZoo's own tests require.
 
     Raises:
         ValueError: for options that aren't a mapping, an unknown agent, or states of a wrong length or not finite.
@@ -69,16 +69,18 @@ def initial_states(fleet: Fleet, options: Mapping[str, Any] | None) -> FloatArra
                 UserWarning,
                 stacklevel=3,
             )
-    given = options.get("initial_state")
-    if given is None:
+    value = options.get("initial_state")
+    if value is None:
         return None
-    if not isinstance(given, Mapping):
-        whole = np.asarray(given, dtype=float)
+    if not isinstance(value, Mapping):
+        whole = np.asarray(value, dtype=float)
         if not np.isfinite(whole).all():
-            raise ValueError("option initial_state: states must be finite; {agent: states} gives some of them")
+            raise ValueError(
+                "option initial_state: states must be finite; to set some agents only, give {agent: states}"
+            )
         return whole
     x0 = np.full(fleet.n, np.nan)
-    for agent, states in given.items():
+    for agent, states in value.items():
         try:
             i = fleet.agent(agent)
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""The PettingZoo environment: one copy, dictionaries by agent."""
+"""The PettingZoo environment: dictionaries by agent, from a batch of one environment."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ ParallelStep = tuple[
 
 
 class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
-    """Agents under partial communication, with estimates of those out of earshot: a PettingZoo ParallelEnv.
+    """Agents under partial communication, with estimates of k-hop targets: a PettingZoo ParallelEnv.
 
     Observations, actions, rewards, infos and arguments are described in the modules `consensus_v0`, `formation_v0` and
     `leader_following_v0`, which make such environments.
 
     Args:
-        batched: a `BatchedEnv` of one copy.
+        batched: a `BatchedEnv` with num_envs = 1.
         name: of the environment.
         render_mode: None, "human" or "rgb_array".
 
@@ -44,12 +44,14 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         batched: the environment as arrays.
 
     Raises:
-        ValueError: for an unknown render mode, or several copies.
+        ValueError: for an unknown render mode, or num_envs above 1.
     """
 
     def __init__(self, batched: BatchedEnv, *, name: str, render_mode: str | None = None) -> None:
         if batched.num_envs != 1:
-            raise ValueError(f"a ParallelEnv is one copy; got {batched.num_envs}: use make_vec for several")
+            raise ValueError(
+                f"a ParallelEnv is one environment; got num_envs={batched.num_envs}: use make_vec for several"
+            )
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(
                 f"render_mode must be None, 'human' or 'rgb_array'; got {render_mode!r}; "
@@ -83,7 +85,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             self._renderer = Renderer.of(batched.task, batched.world, title=name)
 
     def __repr__(self) -> str:
-        return f"KHopEnv({self.metadata['name']}, {len(self.possible_agents)} agents)"
+        return f"KHopEnv({self.batched})"
 
     def __str__(self) -> str:
         return str(self.metadata["name"])
@@ -106,13 +108,13 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         """Start a new episode.
 
         Args:
-            seed: draws initial states, disturbances and leaders' routes. Without one, an environment that was seeded
-                goes on with its generator, and one that never was draws fresh entropy.
+            seed: draws initial states, disturbances and leaders' routes. Without a seed, an environment that was
+                seeded goes on with its generator; if it never was, it draws fresh entropy.
             options: {"initial_state": {agent: states}} or the whole fleet's (n,); others are ignored with a warning.
 
         Raises:
             ValueError: for an unknown agent or states of a wrong length.
-            DesignError: for initial states that the observers can't start from.
+            DesignError: for initial states outside the funnels.
         """
         observations, infos = self.batched.reset(seed, initial_states=initial_states(self.batched.fleet, options))
         self.follow(begins=True)
@@ -126,8 +128,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
 
         Raises:
             TypeError: if `actions` isn't a mapping; nothing has changed then.
-            ValueError: if no episode is running, or an action is missing, of an unknown agent, misshapen or not finite;
-                nothing has changed then.
+            ValueError: if no episode is running, or an action is missing, of an unknown agent, of a wrong shape or
+                not finite; nothing has changed then.
         """
         observations, reward, terminated, truncated, infos = self.batched.step(self._flat(actions))
         self.follow()
@@ -141,7 +143,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         )
 
     def observe(self, agent: str) -> Float32Array:
-        """What an agent observes now."""
+        """Observation of an agent at the present time."""
         return self.batched.observations().reshape(-1)[self._columns[self._known(agent)]]
 
     def state(self) -> Float32Array:
@@ -156,8 +158,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         """Continue from `get_state()`'s result, bit for bit.
 
         Raises:
-            TypeError: if it isn't one; nothing has changed then.
-            ValueError: if it is of an environment of another task, actuator or size, saying what differs; likewise.
+            TypeError: if it isn't an `EnvState`; nothing has changed then.
+            ValueError: if it is of an environment of another task, actuator or size, naming the difference; likewise.
         """
         self.batched.set_state(state)
         self._begun = state.generators[0] is not None
@@ -203,17 +205,17 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         flat = self._actions[0]
         for agent, part in self._entries.items():
             if agent not in actions:
-                missing = [one for one in self.agents if one not in actions]
+                missing = [known for known in self.agents if known not in actions]
                 raise ValueError(f"actions are missing for {len(missing)} agents: {', '.join(missing[:8])}")
             try:
-                given = np.asarray(actions[agent], dtype=np.float64)
+                action = np.asarray(actions[agent], dtype=np.float64)
             except (TypeError, ValueError):
                 raise ValueError(f"the action of {agent!r} isn't numbers: {actions[agent]!r}") from None
-            if given.shape != (part.stop - part.start,):
+            if action.shape != (part.stop - part.start,):
                 raise ValueError(
-                    f"the action of {agent!r} must have shape ({part.stop - part.start},); got {given.shape}"
+                    f"the action of {agent!r} must have shape ({part.stop - part.start},); got {action.shape}"
                 )
-            flat[part] = given
+            flat[part] = action
         if len(actions) != len(self._entries):
             for agent in actions:
                 self._known(agent)
@@ -235,7 +237,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         if self._renderer is not None and self.render_mode == "human":
             try:
                 self._draw(self._renderer)
-            except Exception as error:  # whatever is wrong with a display, the step has been made: return its results
+            except Exception as error:  # for any fault of a display: the step has been made, so return its results
                 warnings.warn(f"the window isn't drawn: {error}", RuntimeWarning, stacklevel=3)
 
     def _infos(self, infos: Infos) -> dict[str, dict[str, float]]:
@@ -243,7 +245,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         return {agent: dict(zip(infos, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
 
     def _remember(self, *, begins: bool) -> None:
-        """Add to the trails, or begin new ones: whoever renders seldom sees the whole path."""
+        """Add to the trails, or begin new ones, so that frames show the whole path however seldom they are drawn."""
         if self._renderer is None:
             return
         if begins:
@@ -267,5 +269,7 @@ def _slices(agents: tuple[str, ...], offset: IntArray) -> dict[str, slice]:
 
 def state_space(batched: BatchedEnv) -> Box:
     """The space of `BatchedEnv.state`'s rows."""
-    low, high = (np.array([getattr(one, end) for one in batched.state_fields], np.float32) for end in ("low", "high"))
+    low, high = (
+        np.array([getattr(field, end) for field in batched.state_fields], np.float32) for end in ("low", "high")
+    )
     return Box(low, high, dtype=np.float32)

@@ -1,10 +1,10 @@
-"""From the simulator's arrays to flat float32 vectors: a table of columns, and the compiled loop that walks it."""
+"""From the simulator's arrays to flat float32 vectors: a table of columns, and the compiled loop that reads it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,12 +15,12 @@ from khop_env.observers import FloatArray, IntArray
 # sources of a column's value: none, states, estimates, their guaranteed bounds, inputs, the task's own rows
 CONSTANT, STATE, STATE_COS, STATE_SIN, STATE_RELATIVE = range(5)
 ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, BOUND, INPUT, TASK = range(5, 12)
-_TILE = 32  # environments: a column's values of so many are computed before they are written
+_TILE = 32  # number of environments whose values of a column are computed before they are written
 
 
 @dataclass(frozen=True)
 class Column:
-    """A field and where its value comes from.
+    """A field and the source of its value.
 
     Attributes:
         field: name, unit and bounds.
@@ -63,7 +63,7 @@ class Sources(NamedTuple):
 
 
 class _LiveColumns(NamedTuple):
-    """The columns that aren't constant, an entry each."""
+    """Arrays over the columns that aren't constant, with the attributes of `Column`."""
 
     column: IntArray
     kind: IntArray
@@ -91,9 +91,9 @@ class Readout:
         self.template = np.array([column.value for column in columns], np.float32)
         live = [q for q, column in enumerate(columns) if column.kind != CONSTANT]
         kinds, rows = [columns[q].kind for q in live], [columns[q].row for q in live]
-        # float32 bounds, so that what is clipped to them in float64 is inside them as float32, too
+        # float32 bounds, so that values clipped to them in float64 are inside them as float32, too
         bounds = np.array([columns[q].bounds for q in live], np.float32).reshape(-1, 2).astype(float)
-        self._live = _LiveColumns(
+        live_columns = _LiveColumns(
             np.array(live, np.int64),
             np.array(kinds, np.int64),
             np.array(rows, np.int64),
@@ -102,19 +102,24 @@ class Readout:
             np.ascontiguousarray(bounds[:, 0]),
             np.ascontiguousarray(bounds[:, 1]),
         )
+        self._live: Any = tuple(live_columns)  # Numba recognises the types of a plain tuple more quickly
         self.uses_bounds = BOUND in kinds
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
     def __call__(self, sources: Sources, clipped: IntArray) -> Float32Array:
-        """Vectors (B, columns) in new memory; adds to `clipped` (B, owners) how many values had to be clipped."""
+        """Vectors (B, columns) in new memory; adds the number of clipped values to `clipped` (B, owners)."""
         out = np.empty((sources.x.shape[1], len(self.template)), np.float32)
-        fill(self._live, self.template, sources, out, clipped)
+        fill(self._live, self.template, tuple(sources), out, clipped)
         return out
 
 
 @compiled
-def fill(live: _LiveColumns, template: Float32Array, sources: Sources, out: Float32Array, clipped: IntArray) -> None:
-    """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner."""
+def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, clipped: IntArray) -> None:
+    """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner.
+
+    `live` and `sources` are the fields of `_LiveColumns` and `Sources` as plain tuples.
+    """
+    live, sources = _LiveColumns(*live), Sources(*sources)
     x, estimate = sources.x, sources.estimate
     values = np.empty(_TILE)
     for first in range(0, out.shape[0], _TILE):

@@ -1,4 +1,4 @@
-"""The Stable-Baselines3 vector environment: one sub-environment per agent, parameters shared by whoever trains."""
+"""The Stable-Baselines3 vector environment: one row per agent, so that a trained policy is shared between agents."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from khop_env.observers import FloatArray
 
 
 class KHopSB3VecEnv(VecEnv):
-    """Rows are (copy, agent) pairs, the agents of one copy side by side, with Stable-Baselines3's conventions.
+    """Rows are (environment, agent) pairs, the agents of an environment side by side; Stable-Baselines3's conventions.
 
-    Copies whose episode ends are reset in the same step. The info of a row is empty until its episode ends; then it has
-    the last "terminal_observation", "TimeLimit.truncated" (a horizon is a truncation, after which PPO bootstraps),
-    "episode" as Stable-Baselines3's Monitor gives it (return "r" and length "l" of the row's episode, seconds "t" since
-    the environment was made), from which ep_rew_mean is logged, and the keys of the other environments.
+    Environments whose episode ends are reset in the same step. The info of a row is empty until its episode ends; then
+    it has the last "terminal_observation", "TimeLimit.truncated" (a horizon is a truncation, after which PPO
+    bootstraps), "episode" as Stable-Baselines3's Monitor writes it (return "r" and length "l" of the row's episode,
+    seconds "t" since the environment was made), from which ep_rew_mean is logged, and the infos of `BatchedEnv`.
 
-    The rows of a copy are one environment: they have one seed, their options are put together, and attributes and
-    methods are those of the whole, `batched`.
+    The rows of an environment have one seed, their options are merged, and attributes and methods are those of
+    `batched`.
 
     Args:
-        batched: the copies, with uniform observations.
+        batched: the environments, with uniform observations.
 
     Attributes:
         batched: the environment as arrays (B, N, ...).
-        infos: of the last step, as arrays (B, N), before copies that ended were reset.
+        infos: of the last step, as arrays (B, N), before the environments that ended were reset.
 
     Raises:
         ValueError: for ragged observations.
@@ -53,8 +53,11 @@ class KHopSB3VecEnv(VecEnv):
         )
         super().__init__(batched.num_envs * len(batched.agents), *single_spaces(batched))
 
+    def __repr__(self) -> str:
+        return f"KHopSB3VecEnv({self.num_envs} rows; {self.batched})"
+
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the next reset: copy b starts from seed + b.
+        """Seed the next reset: environment b starts from seed + b.
 
         Args:
             seed: drawn from NumPy's global generator if left out, which Stable-Baselines3 seeds.
@@ -69,7 +72,7 @@ class KHopSB3VecEnv(VecEnv):
     def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
         """Options of the next reset, as for the ParallelEnv: the same for all rows, or for each row.
 
-        Rows of one copy may give different agents' initial states.
+        Rows of one environment may set initial states of different agents.
 
         Raises:
             ValueError: for a list of another length, or of anything but dictionaries.
@@ -80,15 +83,15 @@ class KHopSB3VecEnv(VecEnv):
                     f"options are a dictionary, or a list with one for each of the {self.num_envs} rows; got "
                     f"{len(options)}"
                 )
-            options = [dict(reset_options(one)) for one in options]
+            options = [dict(reset_options(row_options)) for row_options in options]
         super().set_options(options)
 
     def reset(self) -> Float32Array:
-        """Start new episodes in all copies, with what `seed` and `set_options` were given, once.
+        """Start new episodes in all environments, with the seed and options set before, which are used once.
 
         Raises:
             ValueError: for an unknown agent, or states of a wrong length, not finite, or different ones of rows of one
-                copy.
+                environment.
         """
         seeds = self._seeds[:: len(self.batched.agents)]
         observations, _ = self.batched.reset(seeds, initial_states=self._initial_states())
@@ -137,21 +140,21 @@ class KHopSB3VecEnv(VecEnv):
         """Nothing to close."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The same attribute of the whole for every row.
+        """An attribute of `batched`, once for every row.
 
         Raises:
-            AttributeError: for one that there isn't.
-            IndexError: for a row that there isn't.
+            AttributeError: if `batched` has no such attribute.
+            IndexError: if a row is out of range.
         """
         value = None if attr_name == "render_mode" else getattr(self.batched, attr_name)
         return [value for _ in self._rows(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the whole, for all rows at once.
+        """Set an attribute of `batched`, for all rows at once.
 
         Raises:
-            AttributeError: for some of the rows only, or an attribute that there isn't.
-            IndexError: for a row that there isn't.
+            AttributeError: for some of the rows only, or if `batched` has no such attribute.
+            IndexError: if a row is out of range.
         """
         self._require_all(f"{attr_name!r} can be set", self._rows(indices))
         if not hasattr(self.batched, attr_name):
@@ -161,11 +164,11 @@ class KHopSB3VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the whole once; the result stands for every row that is asked for.
+        """Call a method of `batched` once; the result is repeated for every row in `indices`.
 
         Raises:
-            AttributeError: for a method that there isn't, or one that changes all rows if it is called for some.
-            IndexError: for a row that there isn't.
+            AttributeError: if `batched` has no such method, or if it changes all rows and is called for some.
+            IndexError: if a row is out of range.
         """
         rows = self._rows(indices)
         if method_name in ("reset", "step", "set_state"):
@@ -178,10 +181,10 @@ class KHopSB3VecEnv(VecEnv):
         return [False for _ in self._rows(indices)]
 
     def _rows(self, indices: VecEnvIndices) -> list[int]:
-        """Numbers of rows; negative ones count from the end.
+        """Indices of rows; negative ones count from the end.
 
         Raises:
-            IndexError: for a row that there isn't.
+            IndexError: if a row is out of range.
         """
         chosen = list(self._get_indices(indices))
         for row in chosen:
@@ -193,14 +196,14 @@ class KHopSB3VecEnv(VecEnv):
         if set(rows) != set(range(self.num_envs)):
             raise AttributeError(
                 f"rows share one environment: {what} for all {self.num_envs} of them, not for {len(set(rows))}; "
-                "`batched` is the environment, and batched.reset(env_ids=...) resets some copies"
+                "`batched` is the environment, and batched.reset(env_ids=...) resets some of the batch"
             )
 
     def _initial_states(self) -> FloatArray | None:
-        """(B, n) what the options of each copy's rows say together; nan where they say nothing.
+        """(B, n) initial states from the merged options of each environment's rows; nan where they are drawn.
 
         Raises:
-            ValueError: for rows of one copy that differ.
+            ValueError: for rows of one environment that set the same states differently.
         """
         if not any(self._options):
             return None
@@ -217,11 +220,11 @@ class KHopSB3VecEnv(VecEnv):
                     f"option initial_state: expected {{agent: states}}, or an array of shape ({fleet.n},) or "
                     f"{x0.shape}; got {states.shape} for row {row}"
                 )
-            given = np.isfinite(states)
-            if np.any(given & np.isfinite(x0[b]) & (x0[b] != states)):
+            is_set = np.isfinite(states)
+            if np.any(is_set & np.isfinite(x0[b]) & (x0[b] != states)):
                 raise ValueError(
-                    f"option initial_state: row {row} and a row before it are agents of copy {b}, and give the same "
-                    "states different values; give each agent's once, or the same in all rows of the copy"
+                    f"option initial_state: row {row} and a row before it are agents of environment {b}, and give the "
+                    "same states different values; give each agent's once, or the same in all rows of the environment"
                 )
-            x0[b, given] = states[given]
+            x0[b, is_set] = states[is_set]
         return x0

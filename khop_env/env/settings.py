@@ -17,13 +17,13 @@ NUMBER = (int, float, np.integer, np.floating)
 
 @dataclass(frozen=True)
 class Settings:
-    """What can be chosen of an environment beside its scenario and its task.
+    """Arguments of an environment beside its scenario and its task.
 
     Attributes:
-        observe: what the slots of agents out of earshot hold: their "estimate", the truth ("oracle"), or nothing
+        observe: content of the slots of k-hop targets: their "estimate", their true states ("oracle"), or zeros
             ("local").
-        bounds: whether they hold the guaranteed bound delta(t) on the estimate's error, too.
-        uniform: one padded Box for all agents; or exactly what each agent has.
+        bounds: whether slots also hold the guaranteed bound delta(t) on the estimate's error.
+        uniform: True for one padded Box for all agents, False for a Box without padding for each agent.
         max_cycles: control periods after which an episode is truncated.
         control_period: time between actions in s.
         dt: the simulator's step in s; the control period by default.
@@ -34,7 +34,7 @@ class Settings:
         threads: of the observers' solve.
 
     Raises:
-        ValueError: naming the argument, what was given and what is expected.
+        ValueError: for an argument out of range; the message names it, its value and the valid range.
     """
 
     observe: Observe = "estimate"
@@ -102,12 +102,12 @@ class Settings:
 
     @property
     def inputs_are_states(self) -> bool:
-        """Whether the actuator remembers its input, which agents have to see then."""
+        """True if the actuator remembers its input, which agents then observe."""
         return not isinstance(self.actuator, Direct)
 
 
 class SettingsArguments(TypedDict, total=False):
-    """The same as keyword arguments, for type checkers."""
+    """`Settings` as keyword arguments, for type checkers."""
 
     observe: Observe
     bounds: bool

@@ -1,4 +1,4 @@
-"""What an environment has to remember, and what it returns."""
+"""The state of an environment that is saved and restored, and types of its results."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
 from khop_env.env.actuators import described
 from khop_env.env.layout import Float32Array
 from khop_env.env.settings import Settings
@@ -40,10 +41,10 @@ class EnvState:
         inputs: (m, B) inputs in force, as fractions of their limits.
         cycles: (B,) control periods since reset.
         over: (B,) whether the episode has ended, or none has begun.
-        environment: what the state belongs to, as `signature` gives it.
+        environment: properties of the environment that the state belongs to, as `signature` returns them.
         task: the task's memory, by name.
-        generators: one per copy; None before the first reset.
-        seeded: (B,) whether a copy was ever reset with a seed.
+        generators: one per environment; None before the first reset.
+        seeded: (B,) whether the environment was ever reset with a seed.
     """
 
     simulator: SimulatorState
@@ -55,11 +56,13 @@ class EnvState:
     generators: list[np.random.Generator | None]
     seeded: NDArray[np.bool_]
 
+    __repr__ = brief
+
     def require_of(self, environment: Mapping[str, tuple[str, ...]]) -> None:
         """Refuse an environment that the state doesn't belong to.
 
         Raises:
-            ValueError: naming what differs, and up to three things that only one of the two has.
+            ValueError: if they differ; the message names the property, and up to three values of each.
         """
         for what in {**environment, **self.environment}:
             ours, theirs = environment.get(what, ()), self.environment.get(what, ())
@@ -73,15 +76,15 @@ class EnvState:
 def signature(
     task: Task, world: World, settings: Settings, disturbance: Disturbance | None
 ) -> dict[str, tuple[str, ...]]:
-    """What two environments must have in common for one to continue from the other's state, in words."""
+    """Properties, in words, that two environments must have in common to continue from each other's state."""
     design = world.design
     steps = f"{settings.control_period:g} s in {settings.substeps} steps of order {settings.order}"
-    bounds = dict.fromkeys(repr(bound) for bound in (*design.states.bounds, *design.inputs.bounds))
+    bounds = dict.fromkeys(described(bound) for bound in (*design.states.bounds, *design.inputs.bounds))
     return {
         **task.signature(world),
-        "actuators": (described(settings.actuator),),  # type: ignore[arg-type]
+        "actuators": (described(settings.actuator),),
         "control periods": (steps,),
-        "disturbances": (repr(disturbance),),
+        "disturbances": ("none" if disturbance is None else described(disturbance),),
         "bounds": tuple(bounds),
         "numbers of hops": (f"k = {design.k}",),
     }

@@ -1,4 +1,4 @@
-"""The Gymnasium vector environment: B copies of N agents as B x N rows."""
+"""The Gymnasium vector environment: B environments of N agents as B x N rows."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ VectorStep = tuple[Float32Array, FloatArray, NDArray[np.bool_], NDArray[np.bool_
 
 
 class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
-    """Rows are (copy, agent) pairs, the agents of one copy side by side: row b * N + i is agent i of copy b.
+    """Rows are (environment, agent) pairs, environment by environment: row b * N + i is agent i of environment b.
 
-    What happens to a copy whose episode ends, `autoreset_mode`, is one of Gymnasium's three ways:
+    `autoreset_mode` is one of Gymnasium's three ways to reset an environment whose episode has ended:
 
     - "same_step": it is reset in the same step. Its rows hold the next episode's first observation, and
-      infos["final_obs"] and infos["final_info"] the last one's. Every row of every step is a transition, which is what
-      TorchRL and most training loops expect. Gymnasium's NormalizeObservation refuses it, and before Gymnasium 1.4 its
+      infos["final_obs"] and infos["final_info"] the last one's. Every row of every step is a transition, as TorchRL
+      and most training loops expect. Gymnasium's NormalizeObservation refuses it, and before Gymnasium 1.4 its
       wrappers for observations do, too, and RecordEpisodeStatistics and NormalizeReward miss a step per episode.
     - "next_step": it is reset in the step after; its rows hold the last observation until then. In that step its
       actions are ignored, its rewards are 0, and its rows hold the next episode's first observation. This is
       Gymnasium's own default, with which all of its wrappers work.
     - "disabled": it waits for `reset(options={"reset_mask": mask})`.
 
-    Without autoreset, and as arrays (B, N, ...) for centralised training, the same is `batched`.
+    `batched` has the same as arrays (B, N, ...), without autoreset, for centralised training.
 
     Args:
-        batched: the copies, with uniform observations.
+        batched: the environments, with uniform observations.
         name: of the environment.
         autoreset_mode: "same_step", "next_step", "disabled", or a `gymnasium.vector.AutoresetMode`; "same_step" if left
             out, with a warning where Gymnasium's wrappers would miscount.
@@ -49,7 +49,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
     Attributes:
         batched: the environment as arrays (B, N, ...).
         num_envs: B x N rows.
-        autoreset_mode: a `gymnasium.vector.AutoresetMode`, which metadata["autoreset_mode"] holds, too.
+        autoreset_mode: a `gymnasium.vector.AutoresetMode`, also in metadata["autoreset_mode"].
 
     Raises:
         ValueError: for ragged observations, or another autoreset mode.
@@ -60,7 +60,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
         if autoreset_mode is None and _WRAPPERS_MISCOUNT:
             warnings.warn(
                 f"Gymnasium {gymnasium.__version__}'s RecordEpisodeStatistics and NormalizeReward miss a step per "
-                "episode where copies are reset in the same step: give autoreset_mode='next_step' to use them, "
+                "episode where environments are reset in the same step: give autoreset_mode='next_step' to use them, "
                 "autoreset_mode='same_step' otherwise",
                 UserWarning,
                 stacklevel=3,
@@ -73,14 +73,17 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
+    def __repr__(self) -> str:
+        return f"KHopVectorEnv({self.num_envs} rows, autoreset {self.autoreset_mode.name.lower()}; {self.batched})"
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Float32Array, dict[str, Any]]:
-        """Start new episodes in all copies, or in those of a mask.
+        """Start new episodes in all environments, or in those of a mask.
 
         Args:
-            seed: copy b starts from seed + b, or from the b-th of B seeds.
-            options: as for the ParallelEnv; and "reset_mask", (rows,) of bool, the same for all agents of a copy.
+            seed: environment b starts from seed + b, or from the b-th of B seeds.
+            options: as for the ParallelEnv; and "reset_mask", (rows,) of bool, equal in all rows of an environment.
 
         Returns:
             Observations of all rows, and infos of those that were reset.
@@ -91,7 +94,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
         batched, chosen = self.batched, np.ones(self.batched.num_envs, bool)
         options = dict(reset_options(options))  # wrappers look for the mask in the caller's own
         if "reset_mask" in options:
-            chosen = self._copies(options.pop("reset_mask"))
+            chosen = self._environments(options.pop("reset_mask"))
         which = np.flatnonzero(chosen)
         if isinstance(seed, Sequence) and len(seed) == batched.num_envs:
             seed = [seed[b] for b in which.tolist()]
@@ -108,7 +111,8 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
             actions: (rows, m) in [-1, 1].
 
         Raises:
-            ValueError: for actions of a wrong shape or not finite, or, without autoreset, a copy whose episode is over.
+            ValueError: for actions of a wrong shape or not finite, or, without autoreset, an environment whose
+                episode is over.
         """
         batched, agents = self.batched, len(self.batched.agents)
         values = np.asarray(actions)
@@ -140,26 +144,26 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
     def _rows(self, observations: Float32Array) -> Float32Array:
         return observations.reshape(self.num_envs, -1)
 
-    def _copies(self, mask: Any) -> NDArray[np.bool_]:
-        """(B,) the copies of a mask of rows.
+    def _environments(self, mask: Any) -> NDArray[np.bool_]:
+        """(B,) mask of environments from a mask of rows.
 
         Raises:
-            ValueError: for anything but a mask of whole copies, at least one of them.
+            ValueError: for anything but a mask of all rows of one or more environments.
         """
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             got = f"{mask.dtype} of shape {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
             raise ValueError(f"option reset_mask must be an array of {self.num_envs} bool, one per row; got {got}")
-        of_copy = mask.reshape(self.batched.num_envs, -1)
+        by_env = mask.reshape(self.batched.num_envs, -1)
         if not mask.any():
             raise ValueError("option reset_mask has no True: there is nothing to reset")
-        torn = np.flatnonzero(of_copy.any(axis=1) & ~of_copy.all(axis=1))
+        torn = np.flatnonzero(by_env.any(axis=1) & ~by_env.all(axis=1))
         if torn.size:
-            b, agents = int(torn[0]), of_copy.shape[1]
+            b, agents = int(torn[0]), by_env.shape[1]
             raise ValueError(
-                f"option reset_mask: rows {b * agents} to {b * agents + agents - 1} are the agents of copy {b}, which "
-                f"are reset together: mask all or none; got {of_copy[b].tolist()}"
+                f"option reset_mask: rows {b * agents} to {b * agents + agents - 1} are the agents of environment {b}, "
+                f"which are reset together: mask all or none; got {by_env[b].tolist()}"
             )
-        return np.asarray(of_copy.all(axis=1))
+        return np.asarray(by_env.all(axis=1))
 
     def _described(self, infos: Infos, rows: NDArray[np.bool_]) -> dict[str, Any]:
         """Infos in Gymnasium's form: an array per key, and which rows have it; 0 in the others."""
@@ -190,7 +194,7 @@ def require_uniform(batched: BatchedEnv, what: str) -> None:
     """Refuse ragged observations.
 
     Raises:
-        ValueError: with `what` needs uniform ones.
+        ValueError: naming `what`, which needs uniform observations.
     """
     if not batched.settings.uniform:
         raise ValueError(f"{what} has one space for all rows: it needs uniform=True")

@@ -1,8 +1,8 @@
-"""Observers as objects that own their memory: what every realisation has in common.
+"""Base of all realisations of the observers: objects that own their memory.
 
 A simulator's state is the plant's part and one dictionary of arrays, the observers' memory. The plant moves under its
-law and disturbance; the observers say when, because the paper's continuous-time observers are integrated together with
-it, stage by stage.
+law and disturbance; the observers call its stages, because the paper's continuous-time observers are integrated
+together with it, stage by stage.
 """
 
 from __future__ import annotations
@@ -82,8 +82,7 @@ class Certified(NamedTuple):
 
     Attributes:
         bound: (P, B) in the units of the estimates.
-        basis: what it rests on: a "theorem" of the paper, in continuous time; or the "construction" of the step, at
-            every grid point.
+        basis: "theorem": the paper's, in continuous time; or "construction": of the step, at every grid point.
     """
 
     bound: FloatArray
@@ -105,7 +104,7 @@ class Observers(Protocol):
         """Get ready; called once, before everything else.
 
         Args:
-            design: who estimates whom, and within which funnels.
+            design: the pairs (observer, target) and their funnels.
             num_envs: number of environments B.
         """
         ...
@@ -122,9 +121,9 @@ class Observers(Protocol):
         Args:
             memory: of all environments; the others keep every bit.
             env_ids: (R,) their indices.
-            rngs: (R,) generators, for realisations that draw random numbers; whatever they draw from these themselves
-                changes what is drawn after them, so take `rng.spawn(1)`.
-            first_guess: (n,) from which all estimates start.
+            rngs: (R,) generators, for realisations that draw random numbers; drawing from them directly changes later
+                draws of the episode, so use `rng.spawn(1)`.
+            first_guess: (n,) initial value of all estimates.
         """
         ...
 
@@ -167,7 +166,7 @@ class Extremes(NamedTuple):
     input_relative: FloatArray
 
     def kept(self) -> FloatArray:
-        """(B,) the larger of the two ratios of disagreements: below 1 while everyone is inside every funnel."""
+        """(B,) the larger of the two ratios of disagreements: below 1 while all are inside their funnels."""
         return np.maximum(self.normalized, self.input_normalized)
 
     def copied(self) -> Extremes:
@@ -185,15 +184,16 @@ class WidthsNow:
 
     def __init__(self, bank: FunnelBank, num_envs: int) -> None:
         self._bank = bank
-        self._time = np.full(num_envs, np.nan)
+        self._time = b""
         self._values = np.ones((len(bank), num_envs))
 
     def at(self, t: FloatArray) -> FloatArray:
         """(rows, B) widths at the times `t` (B,); overwritten by the next instant's."""
-        if not np.array_equal(t, self._time):
-            self._time.fill(np.nan)  # whatever the evaluation raises, half of it isn't taken for the whole
+        now = t.tobytes()
+        if now != self._time:
+            self._time = b""  # if the evaluation raises, its partial results aren't used
             self._bank.evaluate(t, self._values)
-            self._time[...] = t
+            self._time = now
         return self._values
 
 
@@ -201,7 +201,7 @@ class FunnelObservers:
     """The paper's state and input observers (PPSO and PPIO), however they are stepped.
 
     Attributes:
-        design: who estimates whom, and within which funnels.
+        design: the pairs (observer, target) and their funnels.
         num_envs: number of environments B.
         rho: the state observers' funnels now.
         omega: the input observers'.
@@ -210,7 +210,7 @@ class FunnelObservers:
     basis: Basis = "theorem"
 
     def prepare(self, design: ObserverDesign, num_envs: int) -> None:
-        """Allocate what steps of `design` need in `num_envs` environments."""
+        """Allocate the buffers for steps of `design` in `num_envs` environments."""
         self.design, self.num_envs = design, num_envs
         self.rho, self.omega = WidthsNow(design.states.rho, num_envs), WidthsNow(design.inputs.rho, num_envs)
         self._error_bound = WidthsNow(design.states.error_bounds, num_envs)
@@ -229,7 +229,7 @@ class FunnelObservers:
             values[:, env_ids] = guess
 
     def bound(self, state: PlantState, out: FloatArray) -> Certified:
-        """Delta: what the design rule guarantees as long as every disagreement is inside its funnel (Problem 2)."""
+        """Delta, which the design rule guarantees while every disagreement is inside its funnel (Problem 2)."""
         out[...] = self._error_bound.at(state.t)
         return Certified(out, self.basis)
 
@@ -237,7 +237,14 @@ class FunnelObservers:
         """Raise running maxima of |xi| / rho and |x_tilde| / delta, and of the same for inputs, to those of a state."""
         memory = state.memory
         for funnels, widths, estimate, source, normalized, relative in (
-            (self.design.states, self.rho, memory["estimate"], state.x, extremes.normalized, extremes.relative),
+            (
+                self.design.states,
+                self.rho,
+                memory["estimate"],
+                state.x,
+                extremes.normalized,
+                extremes.relative,
+            ),
             (
                 self.design.inputs,
                 self.omega,
@@ -249,4 +256,4 @@ class FunnelObservers:
         ):
             if funnels.layout.size:
                 rho = widths.at(state.t)
-                largest_ratios(funnels.layout.arrays, estimate, source, rho, funnels.gain, normalized, relative)
+                largest_ratios(funnels.layout.packed, estimate, source, rho, funnels.gain, normalized, relative)

@@ -17,6 +17,7 @@ from functools import cached_property
 import networkx as nx
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.observers.performance import FunnelBank, PerformanceFunction, scaled
 from khop_env.physics import Fleet, Links, k_hop_neighbors, validate_graph
@@ -29,12 +30,12 @@ All observers of a target share it; bounds that differ between observers go thro
 
 
 class DesignError(ValueError):
-    """The observers can't be designed as asked; the message says which number would do."""
+    """The observers can't be designed with these arguments; the message names a value that is feasible."""
 
 
 @dataclass(frozen=True)
 class TargetObservers:
-    """Which simplification the observers of one target use.
+    """Options of the observers of one target: the paper's simplifications.
 
     Attributes:
         drift: whether the observers know f_i (without it the agent's motion has to be bounded: Theorem 2).
@@ -48,19 +49,21 @@ class TargetObservers:
 
 @dataclass(frozen=True, eq=False)
 class Funnels:
-    """The funnels of one kind of observer: a layout, the bounds on the errors, and what the design rule makes of them.
+    """The funnels of one kind of observer: a layout, the bounds on the errors, and the design rule's results.
 
     Attributes:
-        layout: who estimates whom.
+        layout: the pairs (observer, target).
         bounds: per row of the layout, delta (or theta): the bound on the estimation error.
     """
 
     layout: PairLayout
     bounds: tuple[PerformanceFunction, ...]
 
+    __repr__ = brief
+
     @cached_property
     def gain(self) -> FloatArray:
-        """(rows,) lambda_min(M_i) / sqrt(eta_i) of each row's target: what the design rule multiplies delta by."""
+        """(rows,) lambda_min(M_i) / sqrt(eta_i) of each row's target: the design rule's factor on delta."""
         per_target = self.layout.eigenvalues[:, 0] / np.sqrt(self.layout.arrays.observers)
         return per_target[self.layout.row_target]
 
@@ -88,13 +91,13 @@ class Funnels:
         """(rows,) largest |xi(0)| over the initial set, as a fraction of rho(0): must be below 1.
 
         Args:
-            radius: (n,) how far the true component may start from the observers' common first guess.
+            radius: (n,) largest distance of each true component from the observers' common first guess at t = 0.
         """
         start = self.rho.evaluate(np.zeros(1), np.empty((self.layout.rows, 1)))[:, 0]
         return self.largest_relay() * radius[self.layout.row_source] / start
 
     def smallest_initial_bound(self, radius: FloatArray) -> FloatArray:
-        """(rows,) the infimum of the delta(0) that are feasible for the initial set; take any larger one.
+        """(rows,) infimum of the delta(0) that are feasible for the initial set; any larger value is feasible.
 
         Args:
             radius: as in `feasible_at_start`.
@@ -102,10 +105,10 @@ class Funnels:
         return self.largest_relay() * radius[self.layout.row_source] / self.gain
 
     def explicit_step_bound(self) -> FloatArray:
-        """(targets,) no explicit Euler step longer than this (s) is stable at steady state, even at e = 0.
+        """(targets,) longest stable step of explicit Euler at steady state and e = 0, in s.
 
-        Its linearisation there is 2 / (lambda_max(M_i) phi''(0) / rho(inf)^2) with phi''(0) = 4. Off centre the bound
-        shrinks a hundredfold, so a step has to stay far below it.
+        It is 2 / (lambda_max(M_i) phi''(0) / rho(inf)^2) with phi''(0) = 4. Away from e = 0 the stable step is up to a
+        hundred times shorter, so choose steps far below it.
         """
         floor = self.rho.infimum()
         per_target = np.full(len(self.layout.target), np.inf)
@@ -124,13 +127,13 @@ class ObserverDesign:
         delta: bound on the state estimation errors: one performance function for all, or one `Bound` per target.
         theta: likewise for the input estimation errors; may be None where no target has an input observer.
         relay: whether agents relay their neighbours' states (Assumption 4); without it 1-hop neighbours are estimated
-            too, from what the target itself sends (the paper's remarks).
-        targets: per agent which observers it gets; a `TargetObservers()` each by default, without the input observer
+            too, from the target's own messages (the paper's remarks).
+        targets: per agent the options of its observers; `TargetObservers()` by default, without the input observer
             where the input map depends on the state.
 
     Raises:
-        DesignError: an input observer for an agent whose g depends on its state, none for one whose g is unbounded,
-            or a missing or misshapen bound.
+        DesignError: an input observer for an agent whose g depends on its state, none for an agent whose g is
+            unbounded, or a bound that is missing or of a wrong length.
         ValueError: a graph that isn't undirected, connected and labelled 0..N-1.
     """
 
@@ -186,6 +189,13 @@ class ObserverDesign:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
+    def __str__(self) -> str:
+        pairs = f"{self.states.layout.pairs} state and {self.inputs.layout.pairs} input observers"
+        return f"{self.fleet}; k={self.k}{'' if self.relay else ', no relays'}, {pairs}"
+
+    def __repr__(self) -> str:
+        return f"ObserverDesign({self})"
+
     def with_bounds(
         self,
         delta: PerformanceFunction | Mapping[int, Bound],
@@ -216,24 +226,24 @@ class ObserverDesign:
                 raise DesignError(
                     f"{name}: expected an instance, got the class {bound.__name__}; write {bound.__name__}(...)"
                 )
-            several = list(bound) if isinstance(bound, Sequence) else [bound] * n
-            if len(several) != n or not all(isinstance(one, PerformanceFunction) for one in several):
+            functions = list(bound) if isinstance(bound, Sequence) else [bound] * n
+            if len(functions) != n or not all(isinstance(f, PerformanceFunction) for f in functions):
                 raise DesignError(
                     f"{name} of agent {self.fleet.ids[i]!r}: expected a performance function or a sequence of {n}, one "
                     f"per state component, got {bound!r}"
                 )
-            rows.extend(several)  # type: ignore[arg-type]
+            rows.extend(functions)  # type: ignore[arg-type]
         return tuple(rows)
 
     def require_feasible_start(self, state_radius: FloatArray, input_radius: FloatArray) -> None:
         """Refuse funnels that the initial set doesn't fit into.
 
         Args:
-            state_radius: (n,) how far each component of x may start from the observers' first guess.
+            state_radius: (n,) largest distance of each component of x from the observers' first guess at t = 0.
             input_radius: (n,) likewise for g_i(u_i).
 
         Raises:
-            DesignError: naming the agent and component, |xi(0)| and rho(0), and the smallest delta(0) that would do.
+            DesignError: naming the agent and component, |xi(0)| and rho(0), and the infimum of the feasible delta(0).
         """
         for kind, funnels, radius, letters in (
             ("state", self.states, state_radius, ("xi", "rho", "delta")),

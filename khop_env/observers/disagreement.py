@@ -39,7 +39,7 @@ def disagreement(pairs: PairArrays, estimate: FloatArray, source: FloatArray, ou
     Args:
         pairs: `PairLayout.arrays`.
         estimate: (P, B) the observers' estimates.
-        source: (n, B) the fleet's true vector, of which an observer uses what its neighbours relay.
+        source: (n, B) the fleet's true vector; an observer uses only the parts that its neighbours relay.
         out: (P, B) xi, written.
     """
     batch = estimate.shape[1]
@@ -50,7 +50,7 @@ def disagreement(pairs: PairArrays, estimate: FloatArray, source: FloatArray, ou
             d, h = pairs.diagonal[pair + a], pairs.relay[pair + a]
             for c in range(n):
                 column = offset + a * n + c
-                if h == 0.0:  # no message carries the state to this observer: it must not even be read
+                if h == 0.0:  # no neighbour relays the state to this observer, so it isn't read
                     for env in range(batch):
                         out[column, env] = d * estimate[column, env]
                 else:
@@ -115,7 +115,7 @@ def largest_ratios(
     """Raise running maxima to the largest |xi| / rho and |x_tilde| / delta over all pairs and components.
 
     Args:
-        pairs: `PairLayout.arrays`.
+        pairs: `PairLayout.packed`.
         estimate: (P, B) estimates.
         source: (n, B) the true values.
         rho: (rows, B) funnels.
@@ -123,6 +123,7 @@ def largest_ratios(
         normalized: (B,) running maxima of |xi| / rho; inf where a number isn't finite.
         relative: (B,) running maxima of |x_tilde| / delta.
     """
+    pairs = PairArrays(*pairs)
     batch = estimate.shape[1]
     xi = np.empty(batch)
     for t in range(pairs.observers.size):

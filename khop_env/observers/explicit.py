@@ -1,4 +1,4 @@
-"""The explicit step, as the paper samples its example: accurate and simple, and stable at about 1e-5 s only."""
+"""The explicit step, with which the paper samples its example: accurate and simple, and stable at about 1e-5 s only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from khop_env.observers.prediction import Prediction
 
 
 class FunnelError(RuntimeError):
-    """An explicit step left the funnel, where the observers are no longer defined; a shorter step would not have."""
+    """An explicit step left the funnel, outside which the observers aren't defined; take a shorter step."""
 
 
 class Derivative(NamedTuple):
@@ -72,10 +72,11 @@ class BatchedRightHandSide:
 
 
 class Explicit(FunnelObservers):
-    """Forward Euler, as the paper samples its example: needs steps of about 1e-5 s.
+    """Forward Euler, with which the paper samples its example; needs steps of about 1e-5 s.
 
     Args:
-        right_hand_side: makes the observers' derivative for a design and a number of environments; batched by default.
+        right_hand_side: builds the observers' derivative from a design and a number of environments; batched by
+            default.
     """
 
     name = "explicit"
@@ -84,8 +85,11 @@ class Explicit(FunnelObservers):
     def __init__(self, right_hand_side: Callable[[ObserverDesign, int], RightHandSide] = BatchedRightHandSide) -> None:
         self._make = right_hand_side
 
+    def __repr__(self) -> str:
+        return f"Explicit({self._make.__name__})" if isinstance(self._make, type) else "Explicit()"
+
     def prepare(self, design: ObserverDesign, num_envs: int) -> None:
-        """Allocate what steps of `design` need in `num_envs` environments."""
+        """Allocate the buffers for steps of `design` in `num_envs` environments."""
         super().prepare(design, num_envs)
         self._derivative = self._make(design, num_envs)
         self._xi, self._mu = (np.zeros((funnels.layout.size, num_envs)) for funnels in (design.states, design.inputs))
@@ -94,7 +98,7 @@ class Explicit(FunnelObservers):
         """Advance `state`, a copy of `before`, by `dt` seconds, moving the `plant` with it.
 
         Raises:
-            FunnelError: if a disagreement leaves its funnel, or a jump had put it outside.
+            FunnelError: if a disagreement leaves its funnel, or was outside before the step, after a jump.
             SolveError: if a state isn't finite.
         """
         rate = self._derivative(state, self.rho.at(state.t), self.omega.at(state.t))
@@ -135,7 +139,7 @@ class Explicit(FunnelObservers):
     def _left_funnel(
         self, kind: str, funnels: Funnels, ratio: FloatArray, e: FloatArray, dt: float, start: FloatArray
     ) -> str:
-        """Which observer left its funnel in a step from the times `start`, and the step that would have been stable."""
+        """Error message: the observer that left its funnel in a step from the times `start`, and a stable step."""
         layout = funnels.layout
         column, env = _largest(ratio)
         target = int(layout.row_target[layout.column_row[column]])
@@ -153,6 +157,6 @@ class Explicit(FunnelObservers):
 
 
 def _largest(ratio: FloatArray) -> tuple[int, int]:
-    """Column and environment of the largest |e|; a NaN counts as that."""
+    """Column and environment of the largest |e|; a NaN counts as the largest."""
     column, env = np.unravel_index(int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio))), ratio.shape)
     return int(column), int(env)

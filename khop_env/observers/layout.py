@@ -1,4 +1,4 @@
-"""Who estimates whom: the pairs (observer, target) and the matrices M_i, as flat arrays that compiled loops walk.
+"""Pairs (observer, target) and the matrices M_i, as flat arrays for compiled loops.
 
 Agents differ in n_i and eta_i, so nothing is padded. The estimates of all targets stand in one vector of length P:
 target by target, within a target observer by observer, within an observer component by component.
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
 from khop_env.physics import Links
 
 IntArray = NDArray[np.int64]
@@ -21,10 +22,10 @@ FloatArray = NDArray[np.float64]
 
 
 class PairArrays(NamedTuple):
-    """A `PairLayout` as compiled loops take it: one array per quantity.
+    """Arrays of a `PairLayout` for compiled loops, one per quantity.
 
-    The first six have an entry per target: how many observers it has (eta_i) and how many components (n_i), and where
-    its part begins of the estimates (P,), of the fleet's vector, of the rows, and of the pairs.
+    The first six have an entry per target: its number of observers (eta_i) and of components (n_i), and where its part
+    begins in the estimates (P,), in the fleet's vector, in the rows, and in the pairs.
 
     Attributes:
         observers: (targets,) eta_i.
@@ -33,8 +34,8 @@ class PairArrays(NamedTuple):
         source: (targets,) offset of its state in the fleet's vector.
         row: (targets,) its first row.
         pair: (targets,) its first pair.
-        relay: (pairs,) h_a, the diagonal of H_i: how many neighbours relay the target's true state to the observer, or
-            without the relay assumption 1 for a neighbour of the target and 0 otherwise.
+        relay: (pairs,) h_a, the diagonal of H_i: number of neighbours that relay the target's true state to the
+            observer; without the relay assumption 1 for a neighbour of the target and 0 otherwise.
         diagonal: (pairs,) d_a, the diagonal of M_i.
         entry_start: (pairs + 1,) where each pair's part of `entry` begins.
         entry: (entries,) places within the target of the observers whose estimates the observer receives: the
@@ -85,13 +86,13 @@ class PairLayout:
     target (all observers of a row share its funnel), a *pair* one (observer, target).
 
     Attributes:
-        arrays: everything that compiled loops read.
+        arrays: the arrays that compiled loops read.
         target: (targets,) the estimated agents, ascending; agents without observers are absent.
         observer: (pairs,) the estimating agents, target by target, in an order that keeps M_i's profile small.
         entry_link: (entries,) for each off-diagonal entry of the matrices the link in `links` that carries it.
         relay_start: (pairs + 1,) where each pair's part of `relay_link` begins.
         relay_link: (relays,) the links over which the target's true state reaches each pair's observer.
-        links: who may receive from whom.
+        links: the directed links of the communication graph.
         size: P, the length of the flat vector of estimates.
         rows: number of (target, component) rows.
     """
@@ -105,6 +106,8 @@ class PairLayout:
     links: Links
     size: int
     rows: int
+
+    __repr__ = brief
 
     @staticmethod
     def build(
@@ -130,7 +133,7 @@ class PairLayout:
         blocks: list[tuple[int, ...]] = []
         target: list[int] = []
         observer: list[int] = []
-        heard: list[int] = []
+        relay_count: list[int] = []
         diagonal: list[int] = []
         first: list[int] = []
         entry: list[int] = []
@@ -148,10 +151,10 @@ class PairLayout:
             target.append(i)
             for a, agent in enumerate(members):
                 linked = sorted(place[other] for other in senders[agent] if other in place)
-                # under Assumption 4 whoever receives from the target passes its state on; otherwise only itself does
+                # under Assumption 4 all neighbours of the target relay its state; otherwise only the target sends it
                 relays = sorted(p for p in senders[agent] if i in senders[p]) if relay else [i] * (i in senders[agent])
                 observer.append(agent)
-                heard.append(len(relays))
+                relay_count.append(len(relays))
                 diagonal.append(len(linked) + len(relays))
                 first.append(min(linked[0], a) if linked else a)
                 entry.extend(linked)
@@ -170,7 +173,7 @@ class PairLayout:
                 source=of_target[3],
                 row=of_target[4],
                 pair=of_target[5],
-                relay=np.array(heard, dtype=np.float64),
+                relay=np.array(relay_count, dtype=np.float64),
                 diagonal=np.array(diagonal, dtype=np.float64),
                 entry_start=np.array(entry_start, dtype=np.int64),
                 entry=np.array(entry, dtype=np.int64),
@@ -185,6 +188,11 @@ class PairLayout:
             size=size,
             rows=rows,
         )
+
+    @cached_property
+    def packed(self) -> PairArrays:
+        """`arrays` as a plain tuple, whose type Numba recognises more quickly: for kernels that are called often."""
+        return tuple(self.arrays)  # type: ignore[return-value]
 
     @cached_property
     def blocks(self) -> tuple[TargetBlock, ...]:
@@ -219,7 +227,7 @@ class PairLayout:
 
     @cached_property
     def column_source(self) -> IntArray:
-        """(P,) index into the fleet's flat vector of the true component that each estimate is an estimate of."""
+        """(P,) index into the fleet's flat vector of the true component that each estimate is of."""
         return _joined(np.tile(np.arange(b.sources.start, b.sources.stop), b.observers) for b in self.blocks)
 
     @cached_property
@@ -264,7 +272,7 @@ class PairLayout:
         extremes = np.zeros((len(self.target), 2))
         for eta in np.unique(sizes):
             same = [groups[number] for number in np.flatnonzero(sizes == eta)]
-            # eigvalsh takes a stack; a slice at a time keeps ten thousand targets within the memory of a few
+            # eigvalsh takes a stack; slices bound its memory with ten thousand targets
             step = max(1, 1_000_000 // int(eta) ** 2)
             for first in range(0, len(same), step):
                 some = same[first : first + step]
@@ -280,9 +288,9 @@ def _joined(parts: Iterable[IntArray]) -> IntArray:
 
 
 def _profile_order(adjacency: Sequence[frozenset[int]], members: Sequence[int]) -> list[int]:
-    """Order observers by reversed breadth-first search within their own graph: few non-zeros to eliminate.
+    """Order observers by reversed breadth-first search within their own graph: little fill-in when M_i is factorised.
 
-    (E. Cuthill and J. McKee, Reducing the bandwidth of sparse symmetric matrices, 1969.)
+    Source: E. Cuthill and J. McKee, Reducing the bandwidth of sparse symmetric matrices, 1969.
     """
     inside = set(members)
     degree = {agent: len(adjacency[agent] & inside) for agent in members}

@@ -1,6 +1,6 @@
-"""The observers as robots would run them: one object per agent that knows only what its neighbours sent.
+"""The observers as robots would run them: one object per agent, which uses only the messages of its neighbours.
 
-A reference for the batched right-hand side, slow and plain: what an agent can't compute here, no agent can compute.
+A slow and simple reference for the batched right-hand side, which shows that the observers are decentralised.
 `Explicit(MessagePassing)` integrates it.
 """
 
@@ -21,7 +21,7 @@ from khop_env.physics import AgentModel
 
 @dataclass(frozen=True)
 class Message:
-    """What an agent broadcasts to its 1-hop neighbours.
+    """The message that an agent broadcasts to its 1-hop neighbours.
 
     Attributes:
         state: its own x_i, (n_i,).
@@ -40,7 +40,18 @@ class Message:
 
 @dataclass
 class HeldEstimate:
-    """What one agent holds about one target: design data, fixed, and its two estimates."""
+    """Memory of one agent about one target: fixed design data, and its two estimates.
+
+    Attributes:
+        model: of the target.
+        drift_known: whether the observer uses f_i.
+        rho: funnels of the state observer, one per component.
+        omega: funnels of the input observer; None without one.
+        peers: neighbours that estimate the target, too.
+        relays: neighbours that send the target's true state: common neighbours, or the target itself.
+        estimate: (n_i,) of the state.
+        input_estimate: (n_i,) of g_i(u_i).
+    """
 
     model: AgentModel
     drift_known: bool
@@ -53,12 +64,11 @@ class HeldEstimate:
 
 
 class ObserverAgent:
-    """One agent's observers: reads its inbox, and nothing else.
+    """The observers of one agent; their only inputs are the messages in its inbox.
 
     Args:
-        index: which agent it is.
-        targets: what it holds about each agent that it estimates. `peers` are its neighbours that estimate the target
-            too; `relays` those that send it the target's true state: common neighbours, or the target itself.
+        index: of the agent.
+        targets: its memory about each agent that it estimates.
     """
 
     def __init__(self, index: int, targets: dict[int, HeldEstimate]) -> None:
@@ -67,7 +77,7 @@ class ObserverAgent:
     def message(
         self, state: FloatArray, input_map: FloatArray, measured: Mapping[int, tuple[FloatArray, FloatArray]]
     ) -> Message:
-        """What it sends: its own state and input, what it measures of its neighbours, and its estimates."""
+        """The message to its neighbours: its own state and input, measurements of its neighbours, and its estimates."""
         return Message(
             state,
             input_map,
@@ -95,7 +105,7 @@ class ObserverAgent:
 
 
 def _disagreement(own: FloatArray, others: list[FloatArray]) -> FloatArray:
-    """The sum of how far one's own estimate is from what each of the others says."""
+    """Sum of the differences between the own estimate and each of the others."""
     total = np.zeros_like(own)
     for other in others:
         total += own - other
@@ -125,7 +135,9 @@ class MessagePassing:
         for a in range(len(design.fleet)):
             neighbors = set(graph[a])
             targets = {}
-            for i in design.neighborhoods[a]:  # graph distance is symmetric: a estimates whoever estimates a
+            for i in design.neighborhoods[
+                a
+            ]:  # graph distance is symmetric: a estimates exactly the agents that estimate a
                 relays = neighbors & set(graph[i]) if design.relay else neighbors & {i}
                 targets[i] = HeldEstimate(
                     design.fleet.models[i],
@@ -140,7 +152,7 @@ class MessagePassing:
     def __call__(self, state: PlantState, rho: FloatArray, omega: FloatArray) -> Derivative:
         """See `RightHandSide`."""
         estimate, input_estimate = state.memory["estimate"], state.memory["input_estimate"]
-        found = Derivative(*(np.zeros_like(each) for each in (estimate, input_estimate) * 2))
+        found = Derivative(*(np.zeros_like(values) for values in (estimate, input_estimate) * 2))
         for env in range(state.t.size):
             self._in_one_environment(state, env, found)
         return found

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from khop_env.compiled import compiled
 from khop_env.elementary import expm1
+from khop_env.physics import read_only
 
 FloatArray = NDArray[np.float64]
 
@@ -19,7 +20,7 @@ FloatArray = NDArray[np.float64]
 class PerformanceFunction(Protocol):
     """A function rho(t) that is C^1, positive and bounded, with bounded derivative, for t >= 0 (Definition 1).
 
-    Any object with these two methods will do; `Exponential` is the usual one.
+    Any object with these two methods is one; `Exponential` is the usual choice.
     """
 
     def __call__(self, t: FloatArray) -> FloatArray:
@@ -33,10 +34,10 @@ class PerformanceFunction(Protocol):
 
 @dataclass(frozen=True)
 class Exponential:
-    """rho(t) = (initial - final) exp(-rate t) + final (the paper's equation for a conventional choice).
+    """rho(t) = (initial - final) exp(-rate t) + final, the paper's conventional choice of a performance function.
 
     Attributes:
-        initial: rho(0), in the unit of what it bounds.
+        initial: rho(0), in the unit of the bounded quantity.
         final: rho(infinity), likewise; 0 < final <= initial.
         rate: l, decay rate in 1/s, positive.
 
@@ -67,7 +68,7 @@ class Exponential:
 
 @dataclass(frozen=True)
 class Scaled:
-    """`factor` times another performance function; again one, for factor > 0."""
+    """`factor` times another performance function; a performance function for factor > 0."""
 
     function: PerformanceFunction
     factor: float
@@ -82,7 +83,7 @@ class Scaled:
 
 
 def scaled(function: PerformanceFunction, factor: float) -> PerformanceFunction:
-    """`factor` times `function`, an `Exponential` staying one."""
+    """`factor` times `function`; an `Exponential` if `function` is one."""
     if isinstance(function, Exponential):
         return Exponential(function.initial * factor, function.final * factor, function.rate)
     return Scaled(function, factor)
@@ -130,11 +131,11 @@ class FunnelBank:
         """
         exponentials(t, *self.coefficients, out)
         for row, function in self._others:
-            out[row] = function(t)
+            out[row] = function(read_only(t[:]))
             if not np.all((out[row] > 0.0) & np.isfinite(out[row])):
                 raise ValueError(
                     f"performance function {function!r} gave {out[row].min()} at t in [{t.min()}, {t.max()}] s; "
-                    "Definition 1 wants positive, bounded values"
+                    "Definition 1 requires positive, bounded values"
                 )
         return out
 

@@ -1,4 +1,4 @@
-"""The non-stiff part of the state observers: what they predict from the models, f_i(x_hat) + g_hat."""
+"""The non-stiff part of the state observers: their prediction from the models, f_i(x_hat) + g_hat."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Prediction:
     """f_i(x_hat) + g_hat of all state observers.
 
     Args:
-        design: which observers know f_i, and which have an input observer beside them.
+        design: the observers, with the options `drift` and `input_observer` of each target.
         num_envs: number of environments B.
     """
 
@@ -36,7 +36,7 @@ class Prediction:
         """Write f_i(x_hat) + g_hat into `out` (P, B), at times (B,), estimates (P, B) and input estimates (Q, B)."""
         if not self._all_drifts_known:
             out.fill(0.0)
-        times = t[:, None]
+        times = read_only(t[:, None])
         for model, columns, pairs in self._drifts:
             rates = model.drift(times, read_only(estimate[columns].T.reshape(self._num_envs, pairs, model.n)))
             out[columns] = rates.reshape(self._num_envs, -1).T

@@ -1,4 +1,4 @@
-"""The paper's observers by a coupled proximal step: implicit-explicit Runge-Kutta, inside the funnels at any step."""
+"""The paper's observers by a coupled proximal step: implicit-explicit Runge-Kutta, inside the funnels for any step."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ MOST_THREADS = 256
 
 
 class Proximal(FunnelObservers):
-    """The barrier implicit, everything else explicit: |e| < 1 at every grid point, whatever the step.
+    """Proximal step: the barrier is implicit, everything else explicit; |e| < 1 at every grid point for any step.
 
     Its memory adds "eps" (P, B) and "nu" (Q, B): the transformed disagreements, from which the next solve starts.
 
     Args:
         order: 1 or 2.
-        threads: environments (or targets, in a small batch) are solved by this many threads; results don't depend on
-            it.
+        threads: number of threads that share the environments (or targets, in a small batch); results don't depend
+            on it.
 
     Attributes:
         evaluations: of the barrier, in all steps so far.
@@ -71,11 +71,14 @@ class Proximal(FunnelObservers):
         self.order, self.threads = order, threads
         self.evaluations = 0
         self._tableau = TABLEAUS[order]
-        self._explicit = [np.array(row) for row in self._tableau.explicit]
-        self._implicit = [np.array(row) for row in self._tableau.implicit]
+        self._explicit, self._implicit = self._tableau.explicit, self._tableau.implicit
+        self._dt = math.nan
+
+    def __repr__(self) -> str:
+        return f"Proximal(order={self.order}, threads={self.threads})"
 
     def prepare(self, design: ObserverDesign, num_envs: int) -> None:
-        """Allocate what steps of `design` need in `num_envs` environments."""
+        """Allocate the buffers for steps of `design` in `num_envs` environments."""
         super().prepare(design, num_envs)
         stages = range(len(self._tableau.nodes))
         pairs, input_pairs = design.states.layout.size, design.inputs.layout.size
@@ -97,13 +100,12 @@ class Proximal(FunnelObservers):
         Raises:
             SolveError: if a state, input, disturbance or estimate isn't finite.
         """
-        memory, last = state.memory, before.memory
+        memory, last, weights = state.memory, before.memory, self._weights_of(dt)
         estimate, input_estimate = memory["estimate"], memory["input_estimate"]
         for s, node in enumerate(self._tableau.nodes):
             # rates at the stage before: the state holds that stage's values, at its time
             self._prediction.rate(state.t, estimate, input_estimate, self._rates[s])
-            explicit, implicit = self._explicit[s] * dt, self._implicit[s] * dt
-            tau = float(implicit[s])
+            explicit, implicit, tau = weights[s]
             plant.stage(s, explicit, node * dt, before, state)
             weighted_sum(last["estimate"], explicit, self._rates[: s + 1], estimate)
             if s:
@@ -119,10 +121,22 @@ class Proximal(FunnelObservers):
                 found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], self._input_slopes[s])
                 self._account(found, self.design.inputs, state.g, omega)
 
+    def _weights_of(self, dt: float) -> list[tuple[FloatArray, FloatArray, float]]:
+        """Per stage the explicit weights, the implicit ones, and the last of these, all in s."""
+        if dt != self._dt:
+            explicit, implicit = ([np.array(row) * dt for row in rows] for rows in (self._explicit, self._implicit))
+            self._weights = [(a, b, float(b[-1])) for a, b in zip(explicit, implicit, strict=True)]
+            self._dt = dt
+        return self._weights
+
     def _account(
         self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray
     ) -> None:
-        """Count the work of a solve, and say why it failed if it did."""
+        """Count the work of a solve.
+
+        Raises:
+            SolveError: if the solve failed, with the reason.
+        """
         for evaluations, env, target in found:
             self.evaluations += evaluations
             if env >= 0:

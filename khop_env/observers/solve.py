@@ -23,7 +23,6 @@ of the returned estimates is rho e, whatever the tolerance.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,39 +33,13 @@ from khop_env.observers.layout import FloatArray, IntArray, PairArrays
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
 MAX_ITERATIONS = 200
 LANES = 64  # scalar problems solved side by side: enough to fill vector registers, few enough to stay in cache
-_JUMP = 0.25  # in eps: beyond it a warm start isn't worth more than none
+_JUMP = 0.25  # in eps: beyond it a warm start is no better than a new start
 _LONG_STEP = 1.0  # in eps: beyond it exp is not nearly linear
-
-
-class _Work(NamedTuple):
-    """Scratch memory of the solve of one target, (observers, lanes) each: a lane is one component in one environment.
-
-    Attributes:
-        b: right-hand side of e(z) + s M z = b.
-        e: normalised disagreement.
-        z: impulse phi'(e).
-        gain: d eps / dz.
-        dz: Newton's step in z.
-        pivot: D of the factorisation L D L', inverted.
-        entry: a row of the matrix that is being eliminated.
-        eps: T(e), the unknown.
-        answer: the impulse that Newton's method has arrived at.
-    """
-
-    b: FloatArray
-    e: FloatArray
-    z: FloatArray
-    gain: FloatArray
-    dz: FloatArray
-    pivot: FloatArray
-    entry: FloatArray
-    eps: FloatArray
-    answer: FloatArray
 
 
 @inlined
 def _barrier(eps: float) -> tuple[float, float, float]:
-    """E = tanh(eps / 2), z = phi'(e) = eps (1 + cosh eps), and d eps / dz, of which de/dz = de/deps d eps/dz."""
+    """(e, z, d eps / dz) with e = tanh(eps / 2) and z = phi'(e) = eps (1 + cosh eps); de/dz = de/deps d eps/dz."""
     a = abs(eps)
     growth = expm1(a)
     half = 1.0 / (growth + 2.0)
@@ -113,23 +86,31 @@ def _newton_step(
     eta: int,
     pair: int,
     lanes: int,
-    pairs: PairArrays,
+    diagonal: FloatArray,
+    entry_start: IntArray,
+    entry_of: IntArray,
+    first: IntArray,
     scale: FloatArray,
-    work: _Work,
+    b: FloatArray,
+    e: FloatArray,
+    z: FloatArray,
+    gain: FloatArray,
+    dz: FloatArray,
+    pivot: FloatArray,
+    entry: FloatArray,
     lower: FloatArray,
     row_start: IntArray,
 ) -> None:
     """Solve (diag(de/dz) + s M) dz = b - e - s M z for all lanes, by L D L' in the profile of M (no square roots)."""
-    b, e, z, gain, dz, pivot, entry = work.b, work.e, work.z, work.gain, work.dz, work.pivot, work.entry
     for a in range(eta):
-        d, begin = pairs.diagonal[pair + a], pairs.first[pair + a]
+        d, begin = diagonal[pair + a], first[pair + a]
         for lane in range(lanes):
             dz[a, lane] = d * z[a, lane]
         for j in range(begin, a):
             for lane in range(lanes):
                 entry[j, lane] = 0.0
-        for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
-            other = pairs.entry[k]
+        for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
+            other = entry_of[k]
             for lane in range(lanes):
                 dz[a, lane] -= z[other, lane]
             if other < a:
@@ -140,7 +121,7 @@ def _newton_step(
             dz[a, lane] = b[a, lane] - normalized - scale[lane] * dz[a, lane]
             pivot[a, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * d
         for j in range(begin, a):
-            for k in range(max(begin, pairs.first[pair + j]), j):
+            for k in range(max(begin, first[pair + j]), j):
                 factor = row_start[j] + k
                 for lane in range(lanes):
                     entry[j, lane] -= entry[k, lane] * lower[factor, lane]
@@ -157,16 +138,24 @@ def _newton_step(
         for lane in range(lanes):
             dz[a, lane] *= pivot[a, lane]
     for a in range(eta - 1, 0, -1):
-        for j in range(pairs.first[pair + a], a):
+        for j in range(first[pair + a], a):
             factor = row_start[a] + j
             for lane in range(lanes):
                 dz[j, lane] -= lower[factor, lane] * dz[a, lane]
 
 
 @compiled
-def _land(eta: int, lanes: int, active: FloatArray, work: _Work) -> None:
-    """After long steps, take eps from the impulse that Newton's method has arrived at: it isn't linear in it."""
-    z, gain, dz, answer, u = work.z, work.gain, work.dz, work.answer, work.eps
+def _land(
+    eta: int,
+    lanes: int,
+    active: FloatArray,
+    u: FloatArray,
+    z: FloatArray,
+    gain: FloatArray,
+    dz: FloatArray,
+    answer: FloatArray,
+) -> None:
+    """After long steps, compute eps from the impulse z that Newton's method has reached: eps isn't linear in z."""
     for a in range(eta):
         for lane in range(lanes):
             far = active[lane] * abs(dz[a, lane] * gain[a, lane]) > _LONG_STEP
@@ -182,17 +171,20 @@ def _start_anew(
     lanes: int,
     relay: FloatArray,
     scale: FloatArray,
-    work: _Work,
+    b: FloatArray,
+    e: FloatArray,
+    z: FloatArray,
+    gain: FloatArray,
+    u: FloatArray,
+    total: FloatArray,
     lack: FloatArray,
     stiffness: FloatArray,
 ) -> bool:
-    """Replace a warm start that a jump of the source has made useless; say whether there was one.
+    """Replace a warm start that a jump of the source has made useless; return True if one was replaced.
 
     Since M 1 = h, the equations of all observers add up to sum e + s sum h z = sum b. Where Newton's step for a common
     impulse would be long, every observer starts from the one common impulse that meets the sum.
     """
-    b, e, z, gain, u = work.b, work.e, work.z, work.gain, work.eps
-    total = work.pivot  # its first row is free for now
     links = 0.0
     for lane in range(lanes):
         lack[lane] = 0.0
@@ -204,7 +196,7 @@ def _start_anew(
         for lane in range(lanes):
             total[0, lane] += b[a, lane]
             lack[lane] += b[a, lane] - e[a, lane] - scale[lane] * h * z[a, lane]
-            # de/dz + s h, over deps/dz: what a unit of eps is worth
+            # (de/dz + s h) / (deps/dz): change of the sum per unit of eps
             stiffness[lane] += 0.5 * (1.0 - e[a, lane] * e[a, lane]) + scale[lane] * h / gain[a, lane]
     far = 0.0
     for lane in range(lanes):
@@ -238,7 +230,7 @@ def solve(
     """One proximal step of the observers of a range of targets, in a range of environments.
 
     Args:
-        pairs: `PairLayout.arrays`.
+        pairs: `PairLayout.packed`.
         tau: step of the implicit part, in seconds.
         predictor: (P, B) y*, the estimates after the explicit part of the step.
         source: (n, B) the fleet's vector that is observed (states x, or input maps g) at the end of the step.
@@ -256,6 +248,7 @@ def solve(
         and on nothing else in three hundred thousand random problems up to a million funnel widths away (at most 27
         iterations, 5 on average; two along a run).
     """
+    pairs = PairArrays(*pairs)
     widest = profile = most = 1
     for t in range(targets[0], targets[1]):
         eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
@@ -264,15 +257,17 @@ def solve(
             entries += a - pairs.first[pair + a]
         widest, profile = max(widest, eta), max(profile, entries)
         most = max(most, n * min(max(1, LANES // n), batch[1] - batch[0]))
-    shape = (widest, most)
-    b, e, z, gain, dz = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape)
-    pivot, entry, u, answer = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape)
-    work = _Work(b, e, z, gain, dz, pivot, entry, u, answer)
-    flat_e, flat_z, flat_gain, flat_u = e.reshape(-1), z.reshape(-1), gain.reshape(-1), u.reshape(-1)
+    diagonal, relay, first = pairs.diagonal, pairs.relay, pairs.first
+    entry_start, entry_of = pairs.entry_start, pairs.entry
+    memory = np.empty((9, widest, most))  # one allocation: such overheads dominate the solve of one environment
+    b, e, z, gain, dz = memory[0], memory[1], memory[2], memory[3], memory[4]
+    pivot, entry, u, answer = memory[5], memory[6], memory[7], memory[8]
+    flat = memory.reshape(9, widest * most)
+    flat_e, flat_z, flat_gain, flat_u = flat[1], flat[2], flat[3], flat[7]
     lower = np.empty((profile, most))
     row_start = np.empty(widest, np.int64)
-    inv_rho, scale, active = np.empty(most), np.empty(most), np.empty(most)
-    worst, poison = np.empty(most), np.empty(most)
+    of_lanes = np.empty((5, most))
+    inv_rho, scale, active, worst, poison = of_lanes[0], of_lanes[1], of_lanes[2], of_lanes[3], of_lanes[4]
     evaluations = 0
 
     for t in range(targets[0], targets[1]):
@@ -280,8 +275,8 @@ def solve(
         offset, origin, row = pairs.column[t], pairs.source[t], pairs.row[t]
         entries = 0
         for a in range(eta):
-            row_start[a] = entries - pairs.first[pair + a]
-            entries += a - pairs.first[pair + a]
+            row_start[a] = entries - first[pair + a]
+            entries += a - first[pair + a]
         chunk = max(1, LANES // n)
         for c0 in range(batch[0], batch[1], chunk):
             width = min(chunk, batch[1] - c0)
@@ -300,11 +295,11 @@ def solve(
                         answer[a, place(c * width + env)] = predictor[column, place(c0 + env)]
                         u[a, place(c * width + env)] = eps[column, place(c0 + env)]
             for a in range(eta):
-                d, h = pairs.diagonal[pair + a], pairs.relay[pair + a]
+                d, h = diagonal[pair + a], relay[pair + a]
                 for lane in range(lanes):
                     b[a, lane] = d * answer[a, lane] - h * worst[lane]
-                for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
-                    other = pairs.entry[k]
+                for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
+                    other = entry_of[k]
                     for lane in range(lanes):
                         b[a, lane] -= answer[other, lane]
                 for lane in range(lanes):
@@ -316,21 +311,41 @@ def solve(
             moving = True
             while moving:
                 _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
-                if iteration == 0 and _start_anew(eta, pair, lanes, pairs.relay, scale, work, worst, poison):
+                if iteration == 0 and _start_anew(
+                    eta, pair, lanes, relay, scale, b, e, z, gain, u, pivot, worst, poison
+                ):
                     _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
-                _newton_step(eta, pair, lanes, pairs, scale, work, lower, row_start)
+                _newton_step(
+                    eta,
+                    pair,
+                    lanes,
+                    diagonal,
+                    entry_start,
+                    entry_of,
+                    first,
+                    scale,
+                    b,
+                    e,
+                    z,
+                    gain,
+                    dz,
+                    pivot,
+                    entry,
+                    lower,
+                    row_start,
+                )
                 evaluations += eta * lanes
                 iteration += 1
                 for lane in range(lanes):
                     worst[lane] = 0.0
                     poison[lane] = 0.0
-                # a lane that is done must not move again, or its result would depend on its company
+                # a lane that has converged doesn't move again, or its result would depend on the other lanes
                 for a in range(eta):
                     for lane in range(lanes):
                         on = active[lane] > 0.0
                         step = dz[a, lane] * gain[a, lane] if on else 0.0
                         worst[lane] = max(abs(step), worst[lane])
-                        poison[lane] += 0.0 * step  # 0, or NaN for good, which a maximum may lose
+                        poison[lane] += 0.0 * step  # 0, or NaN once and for all, which a maximum may lose
                         answer[a, lane] = z[a, lane] + dz[a, lane] if on else answer[a, lane]
                         u[a, lane] += step
                 moving = False
@@ -341,7 +356,7 @@ def solve(
                     moving = moving or on
                     longest = max(longest, worst[lane])
                 if longest > _LONG_STEP:
-                    _land(eta, lanes, active, work)
+                    _land(eta, lanes, active, u, z, gain, dz, answer)
                 if moving and iteration == MAX_ITERATIONS:
                     for lane in range(lanes):
                         if active[lane] > 0.0:

@@ -16,13 +16,13 @@ class Solver:
     """Solves for all observers of one layout, by environments or, in a small batch, by targets.
 
     Args:
-        layout: who estimates whom.
+        layout: the pairs (observer, target).
         num_envs: number of environments.
-        threads: how many threads share the work; results don't depend on it.
+        threads: number of threads; results don't depend on it.
     """
 
     def __init__(self, layout: PairLayout, num_envs: int, threads: int) -> None:
-        self._pairs = layout.arrays
+        self._pairs = layout.packed
         targets = len(layout.target)
         by_environment = num_envs >= threads * LANES
         cuts = np.linspace(0, num_envs if by_environment else targets, threads + 1).astype(int).tolist()
@@ -36,7 +36,7 @@ class Solver:
     def __call__(
         self, tau: float, y: FloatArray, source: FloatArray, rho: FloatArray, eps: FloatArray, slope: FloatArray
     ) -> list[tuple[int, int, int]]:
-        """`solve` from the predictor `y`, which the estimates overwrite; what it returns, range by range."""
+        """`solve` from the predictor `y`, which the estimates overwrite; returns its results, range by range."""
         if len(self._ranges) == 1:
             return [solve(self._pairs, tau, y, source, rho, eps, y, slope, *self._ranges[0])]
         if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads

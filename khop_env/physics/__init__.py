@@ -1,7 +1,7 @@
-"""The world: what would be true were nobody watching.
+"""Plant models: agent dynamics, disturbances, fleets, and communication graphs.
 
-Agent models f_i and g_i, disturbances w_i, the fleet that joins them into flat batched vectors, and the graphs that
-say who hears whom. Everything here is a pure function of (t, x, u); randomness is drawn once per episode.
+Agent models f_i and g_i, disturbances w_i, the fleet that joins them into flat batched vectors, and the graphs over
+which agents communicate. Right-hand sides are pure functions of (t, x, u); random numbers are drawn once per episode.
 """
 
 from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean, read_only

@@ -1,4 +1,4 @@
-"""What an agent model is: the right-hand sides f_i and g_i of the paper's equation (1).
+"""Agent models: the right-hand sides f_i and g_i of the paper's equation (1).
 
     x_i' = f_i(x_i) + g_i(x_i, u_i) + w_i(x, t)
 
@@ -13,18 +13,19 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
+Array = TypeVar("Array", bound=np.ndarray)
 IndexArray: TypeAlias = NDArray[np.intp]
-InputLimit: TypeAlias = Any  # given as a number or one per input; read as a float array of shape (m,)
+InputLimit: TypeAlias = Any  # set to a number or one per input; read as a float array of shape (m,)
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The end of an error message about an unknown name: the nearest known one, or all of them."""
+    """End of an error message about an unknown name: the closest known name, or all of them."""
     known = list(known)
     nearest = difflib.get_close_matches(str(name), known, n=1)
     if nearest:
@@ -32,27 +33,26 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f"known: {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}"
 
 
-def read_only(array: FloatArray) -> FloatArray:
-    """A view that can't be written through."""
-    view = array.view()
+def read_only(view: Array) -> Array:
+    """The view itself, which can't be written through any more."""
     view.flags.writeable = False
     return view
 
 
-_PROBES = 8  # random inputs at which it is seen whether g is affine in each input
+_PROBES = 8  # random inputs at which g is checked to be affine in each input
 
 
 def require_shape(model: AgentModel, value: FloatArray, shape: tuple[int, ...], what: str) -> FloatArray:
-    """What a model's right-hand side returned, as an array.
+    """The result of a model's right-hand side as an array, with its shape checked.
 
     Args:
-        model: whose it is.
-        value: what it returned.
-        shape: what it should have.
-        what: the function and its arguments, for the error message.
+        model: The model.
+        value: The result.
+        shape: The expected shape.
+        what: The function and its arguments, for the error message.
 
     Raises:
-        ValueError: The shape is another.
+        ValueError: The shape is different.
     """
     if np.shape(value) != shape:
         raise ValueError(
@@ -62,24 +62,24 @@ def require_shape(model: AgentModel, value: FloatArray, shape: tuple[int, ...], 
     return np.asarray(value)
 
 
-def _same(one: FloatArray, other: FloatArray) -> bool:
-    """Whether rates (K, n) agree, to rounding of the largest of each component."""
-    scale = np.maximum(np.abs(one), np.abs(other)).max(axis=0)
-    return not bool(np.any(np.abs(one - other) > 1e-9 * scale))
+def _same(first: FloatArray, second: FloatArray) -> bool:
+    """True if rates (K, n) agree, to rounding of the largest of each component."""
+    scale = np.maximum(np.abs(first), np.abs(second)).max(axis=0)
+    return not bool(np.any(np.abs(first - second) > 1e-9 * scale))
 
 
 class AgentModel:
     """Base class of agent models: name the states and inputs, then write `drift` and `input_map`.
 
-    A subclass sets the attributes below, on the class or on the instance. One that writes its own `__init__` ends
-    it with `super().__init__()`, which checks them. Models of equal class and equal parameters are equal, and a fleet
-    evaluates neighbours that are equal in one call.
+    A subclass sets the attributes below, on the class or on the instance. If it defines its own `__init__`, it ends
+    with `super().__init__()`, which checks them. Models of equal class and equal parameters are equal, and a fleet
+    evaluates consecutive agents with equal models in one call.
 
     Right-hand sides take time without an axis for the states: t has shape (B, 1) where x has (B, N, n). Next to
     x[..., 0] write t, next to x itself t[..., None].
 
     Attributes:
-        type: What its agents are called, e.g. "unicycle" for "unicycle_0"; lower-case letters, digits and underscores.
+        type: Prefix of its agents' ids, e.g. "unicycle" for "unicycle_0"; lower-case letters, digits and underscores.
         states: Name of each of the n states and its unit, in order.
         inputs: Name of each of the m inputs and its unit, in order.
         position: Names of the states that are the agent's position.
@@ -114,7 +114,7 @@ class AgentModel:
         raise NotImplementedError(f"{self.__class__.__name__} has no drift(t, x)")
 
     def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
-        """g_i: what the input adds to the state's rate of change.
+        """g_i: the contribution of the input to the state's rate of change.
 
         Args:
             t: Time in seconds, of a shape that broadcasts against x[..., 0]: (B, 1) beside an x of shape (B, N, n).
@@ -131,14 +131,14 @@ class AgentModel:
         return math.nan
 
     def explicit_step(self, reach: FloatArray, disturbance: FloatArray) -> float:
-        """Longest step of an explicit method, in s, in which the drift can't make states explode; inf if any will do.
+        """Longest step of an explicit method, in s, for which the drift is stable; inf if every step is.
 
-        This default is inf, right for a drift that is bounded or slow. A model whose drift is stiff, as a strong drag
-        is, overrides it: an explicit method multiplies what decays at the rate r by about 1 - r dt, so that steps
-        beyond 2 / r grow. Simulators divide longer steps.
+        The default is inf, right for a drift that is bounded or slow. A model whose drift is stiff, such as a strong
+        drag, overrides it: an explicit method multiplies a mode with decay rate r by about 1 - r dt, so that it grows
+        for steps beyond 2 / r. Simulators divide longer steps.
 
         Args:
-            reach: Largest |x| that agents start with, shape (n,).
+            reach: Largest |x| of the initial states, shape (n,).
             disturbance: Largest |w|, in state units per second, shape (n,).
         """
         return math.inf
@@ -146,13 +146,13 @@ class AgentModel:
     def input_map_bound(self) -> FloatArray:
         """Bound on each component of |g_i| over all states and all inputs within their limits, shape (n,).
 
-        This default is the largest |g| over the corners of the input box, with inf for what depends on an unlimited
-        input. It is right where g is affine in each input and depends on nothing else. A model with any other g
+        The default is the largest |g| over the corners of the input box, with inf for components that depend on an
+        unlimited input. It is exact if g is affine in each input and depends on nothing else. A model with any other g
         overrides it, with np.inf for a component that has no bound.
 
         Raises:
-            ValueError: g is seen to depend on the state, on time, or on inputs in another way, so that its values at
-                the corners say nothing of the others.
+            ValueError: g depends on the state, on time, or isn't affine in each input, so that its values at the
+                corners don't bound it.
         """
         corners = np.array(list(itertools.product((-1.0, 1.0), repeat=self.m)))
         unlimited = np.isinf(self.input_limit)
@@ -170,7 +170,8 @@ class AgentModel:
             why = why or "isn't affine in each input"
         if why is not None:
             raise ValueError(
-                f"{self.__class__.__name__}.input_map {why}, so that its bound can't be found by trying: write "
+                f"{self.__class__.__name__}.input_map {why}, so that its values at the limits of the inputs don't "
+                "bound it: write "
                 f"input_map_bound(self), returning the largest |g| of each of the {self.n} states' rates over all "
                 "states, times and inputs within their limits as an array, with np.inf where there is none"
             )
@@ -180,11 +181,11 @@ class AgentModel:
         return bound
 
     def checked_input_map_bound(self) -> FloatArray:
-        """`input_map_bound`, after checks of what can be seen of the input map and of the bound itself.
+        """`input_map_bound`, after sampled checks of the input map and checks of the bound.
 
         Raises:
-            ValueError: The input map returns a wrong shape, or depends on the state without saying so; or the bound is
-                misshapen, negative or not a number.
+            ValueError: The input map returns a wrong shape, or depends on the state although `input_map_uses_state` is
+                False; or the bound has a wrong shape, is negative or not a number.
         """
         who, rng = self.__class__.__name__, np.random.default_rng(0)
         u = np.tile(rng.uniform(-1.0, 1.0, self.m) * np.minimum(self.input_limit, 1.0), (2, 1))
@@ -203,7 +204,7 @@ class AgentModel:
         return bound
 
     def _probe(self, t: float, x: FloatArray, u: FloatArray) -> FloatArray:
-        """Values of g at some inputs (K, m), called as a simulator does: with one environment of K agents."""
+        """Values of g at inputs (K, m), evaluated as in a simulator: one environment of K agents."""
         states = np.broadcast_to(x, (1, len(u), self.n)).copy()
         g = self.input_map(np.full((1, 1), t), states, u[None].copy())
         return require_shape(self, g, states.shape, "input_map(t, x, u)")[0]
@@ -226,7 +227,7 @@ class AgentModel:
 
     @property
     def input_map_bounded(self) -> bool:
-        """Whether g is bounded: the paper's Assumption 2-i, under which the input observer can be left out."""
+        """True if g is bounded: the paper's Assumption 2-i, under which the input observer can be left out."""
         return bool(np.isfinite(self.input_map_bound()).all())
 
     def validate(self) -> None:

@@ -39,7 +39,7 @@ class Channels:
 
 
 class Disturbance:
-    """What can be added and attached: a single `Term`, or a `Sum`."""
+    """Base class of disturbances, which can be added and attached: a single `Term`, or a `Sum`."""
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -114,7 +114,7 @@ class Term(Disturbance):
         raise NotImplementedError(f"{self._name} has no add(t, x, drawn, channels, out)")
 
     def channels_of(self, fleet: Fleet, components: Sequence[IndexArray], what: str) -> Channels:
-        """Pair the amplitude with the given state components of each agent; `what` they are, for error messages."""
+        """Pair the amplitude with state components of each agent; `what` names them in error messages."""
         chosen = self._chosen_agents(fleet)
         if isinstance(self.amplitude, tuple):
             wrong = [
@@ -165,7 +165,7 @@ class AttachedDisturbance:
         for term in terms:
             channels = term.channels(fleet)
             np.add.at(self.bound, channels.index, channels.amplitude)
-            count = term.draw(np.random.default_rng(0), channels).size  # a dry run, to learn how many it draws
+            count = term.draw(np.random.default_rng(0), channels).size  # a dry run that counts its random numbers
             self._parts.append((term, channels, slice(self.draws, self.draws + count)))
             self.draws += count
 
@@ -192,7 +192,7 @@ class AttachedDisturbance:
 
 
 def freeze_list(term: Term, name: str) -> None:
-    """Make a list or array, as a scenario file gives, the tuple that a frozen record can hash."""
+    """Turn a list or array, as a scenario file has it, into a tuple, which a frozen dataclass can hash."""
     value = getattr(term, name)
     if isinstance(value, list | np.ndarray):
         object.__setattr__(term, name, tuple(np.asarray(value).tolist()))

@@ -1,7 +1,7 @@
 """The fleet: many agents of several kinds, evaluated as flat batched vectors.
 
 A fleet's state is (B, n): one row per environment, the agents' states one after the other. Agents may differ in
-n_i and m_i; offsets say where each begins, and neighbours of one model are evaluated in one call.
+n_i and m_i; offsets say where each begins, and consecutive agents with equal models are evaluated in one call.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class Fleet:
         input_map_bound: Bounds on the components of |g|, shape (n,).
 
     Raises:
-        ValueError: There are no models, one isn't a model, positions differ in dimension, agents of one type differ
-            in their states or inputs, or an input map is misshapen or not what its model says of it.
+        ValueError: There are no models, an entry isn't a model, positions differ in dimension, agents of one type
+            differ in their states or inputs, or an input map has a wrong shape or contradicts its model's attributes.
     """
 
     def __init__(self, models: Sequence[AgentModel]) -> None:
@@ -102,9 +102,12 @@ class Fleet:
         """Number of agents N."""
         return len(self.models)
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         counts = Counter(model.type for model in self.models)
-        return f"Fleet({', '.join(f'{count} {kind}' for kind, count in counts.items())})"
+        return ", ".join(f"{count} {kind}" for kind, count in counts.items())
+
+    def __repr__(self) -> str:
+        return f"Fleet({self})"
 
     def state_slice(self, agent: int) -> slice:
         """Agent's part of the flat state."""
@@ -115,7 +118,7 @@ class Fleet:
         return slice(int(self.input_offset[agent]), int(self.input_offset[agent + 1]))
 
     def agent(self, which: str | SupportsIndex) -> int:
-        """Index of an agent, given its id or its index.
+        """Index of an agent from its id or its index.
 
         Raises:
             ValueError: There is no such agent.
@@ -185,7 +188,7 @@ class Fleet:
         """The shortest `AgentModel.explicit_step` of all agents.
 
         Args:
-            reach: Largest |x| that they start with, shape (n,).
+            reach: Largest |x| of the initial states, shape (n,).
             disturbance: Largest |w|, in state units per second, shape (n,).
 
         Returns:
@@ -255,11 +258,11 @@ def _check_types(models: tuple[AgentModel, ...], ids: tuple[str, ...]) -> None:
     for i, model in enumerate(models):
         other = first.setdefault(model.type, i)
         for name in ("states", "inputs"):
-            mine, its = dict(getattr(model, name)), dict(getattr(models[other], name))
-            if mine != its:
+            own, known = dict(getattr(model, name)), dict(getattr(models[other], name))
+            if own != known:
                 raise ValueError(
                     f"{ids[i]} and {ids[other]} share the type {model.type!r} but differ in their {name}: "
-                    f"{mine} and {its}; give one of the models another type"
+                    f"{own} and {known}; give one of the models another type"
                 )
 
 

@@ -1,6 +1,6 @@
-"""Communication and task graphs, and who is how many hops away.
+"""Communication and task graphs, hop distances and k-hop neighbours.
 
-The paper's graph G = (V, E): agents are the nodes 0..N-1, an edge joins two that exchange messages.
+The paper's graph G = (V, E): agents are the nodes 0..N-1, an edge joins two neighbours, which exchange messages.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import numpy as np
 
 from khop_env.physics.agent_model import FloatArray
 
-_SHOWN = 8  # entries of a long list shown in an error message
+_LISTED = 8  # entries of a long list that an error message lists
 
 
 def validate_graph(graph: nx.Graph, agents: int, name: str = "communication graph", connected: bool = True) -> nx.Graph:
-    """Check that a graph is one the paper's Assumption 3 speaks of, with the agents as nodes.
+    """Check that a graph satisfies the paper's Assumption 3, with the agents as nodes.
 
     Args:
         graph: An undirected simple graph with the nodes 0..agents-1.
         agents: Number of agents N.
-        name: What error messages call the graph.
-        connected: Whether the graph must be connected, as the theorems need of the communication graph.
+        name: Name of the graph in error messages.
+        connected: Whether the graph must be connected; the theorems require it of the communication graph.
 
     Returns:
         A frozen copy with its nodes in increasing order, so that matrices made from it are in the agents' order.
 
     Raises:
-        ValueError: The graph is directed or a multigraph, is labelled otherwise, has a self-loop or isn't connected.
+        ValueError: The graph is directed or a multigraph, has other nodes, has a self-loop or isn't connected.
     """
     if not isinstance(graph, nx.Graph):
         raise ValueError(f"{name}: expected a networkx.Graph, got {graph!r}")
@@ -73,7 +73,7 @@ def hop_distances(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
 
 
 def _reached_from(source: int, cutoff: int, neighbors: list[list[int]], sets: list[frozenset[int]]) -> dict[int, int]:
-    """{agent: distance} from one source. Few of a dense graph's edges lead to somebody new: sets find them quickly."""
+    """{agent: distance} from one source. Few edges of a dense graph lead to new agents; sets find them quickly."""
     found = {source: 0}
     frontier = [source]
     for hops in range(1, cutoff + 1):
@@ -92,7 +92,7 @@ def _reached_from(source: int, cutoff: int, neighbors: list[list[int]], sets: li
 
 
 def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[int, ...], ...]:
-    """The agents that estimate each agent, and whom it estimates: the paper's k-hop neighbours.
+    """The paper's k-hop neighbours: the agents that each agent estimates, which are those that estimate it.
 
     Args:
         graph: A validated graph on 0..N-1.
@@ -116,28 +116,28 @@ def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[
 
 
 def check_task_graph(task: nx.Graph, communication: nx.Graph, k: int) -> nx.Graph:
-    """Check that both ends of each task edge know of each other: they are at most k hops apart.
+    """Check that the two agents of each task edge are at most k hops apart.
 
     Args:
         task: Pairs of agents that a task relates; needn't be connected.
         communication: A validated communication graph.
-        k: Number of hops up to which agents hear or estimate each other.
+        k: Number of hops up to which agents receive or estimate each other's states.
 
     Returns:
         The task graph, validated.
 
     Raises:
-        ValueError: The task graph is malformed, or has edges that nobody could act on.
+        ValueError: The task graph is malformed, or has edges between agents more than k hops apart.
     """
     task = validate_graph(task, len(communication), name="task graph", connected=False)
     within = hop_distances(communication, k)
     far = [edge for edge in task.edges if edge[1] not in within[edge[0]]]
     if far:
-        shown = [f"{edge} at distance {_distance(communication, *edge)}" for edge in far[:_SHOWN]]
-        rest = f" and {len(far) - _SHOWN} more" if len(far) > _SHOWN else ""
+        listed = [f"{edge} at distance {_distance(communication, *edge)}" for edge in far[:_LISTED]]
+        rest = f" and {len(far) - _LISTED} more" if len(far) > _LISTED else ""
         raise ValueError(
-            f"task graph: nobody could act on edges between agents more than k = {k} hops apart: "
-            f"{', '.join(shown)}{rest}"
+            f"task graph: edges join agents that know nothing of each other, more than k = {k} hops apart: "
+            f"{', '.join(listed)}{rest}"
         )
     return task
 
@@ -160,7 +160,7 @@ def random_geometric_graph(agents: int, mean_degree: float, rng: np.random.Gener
 
     Args:
         agents: Number of agents N.
-        mean_degree: Expected number of agents in range of one that is far from the border; the border lowers the mean,
+        mean_degree: Expected number of agents in range of an agent far from the border; the border lowers the mean,
             the tree raises it.
         rng: Source of the positions.
 
@@ -182,9 +182,9 @@ def random_geometric_graph(agents: int, mean_degree: float, rng: np.random.Gener
     for first in range(0, agents, rows):
         block = points[first : first + rows]
         distance2 = _squared_distances(block, points[first:])
-        one, other = np.nonzero(distance2 < radius2)
-        later = other > one
-        graph.add_edges_from(zip((one[later] + first).tolist(), (other[later] + first).tolist(), strict=True))
+        row, column = np.nonzero(distance2 < radius2)
+        later = column > row
+        graph.add_edges_from(zip((row[later] + first).tolist(), (column[later] + first).tolist(), strict=True))
     graph.add_edges_from(_minimum_spanning_tree(points))
     return graph, points
 
@@ -223,5 +223,5 @@ def _distance(graph: nx.Graph, a: int, b: int) -> str:
 
 def _listed(items: Iterable[object]) -> str:
     items = list(items)
-    shown = ", ".join(map(str, items[:_SHOWN]))
-    return f"{shown} and {len(items) - _SHOWN} more" if len(items) > _SHOWN else shown
+    text = ", ".join(map(str, items[:_LISTED]))
+    return f"{text} and {len(items) - _LISTED} more" if len(items) > _LISTED else text

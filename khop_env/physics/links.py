@@ -1,4 +1,4 @@
-"""Directed communication links: who may receive messages from whom."""
+"""Directed communication links: which agent receives messages from which."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
+
 
 @dataclass(frozen=True, eq=False)
 class Links:
     """The directed links of a communication graph, numbered: sender -> receiver.
 
     An undirected edge is two links. Layouts are built once over all links that may ever be up; which of them are up,
-    and how old is what came over them, is data of an episode (`simulation.LinkState`).
+    and the age of the newest message over each, are data of an episode (`simulation.LinkState`).
 
     Attributes:
         agents: number of agents N.
@@ -26,6 +28,8 @@ class Links:
     agents: int
     sender: NDArray[np.int64]
     receiver: NDArray[np.int64]
+
+    __repr__ = brief
 
     @staticmethod
     def of(graph: nx.Graph) -> Links:
@@ -52,4 +56,4 @@ class Links:
         found: list[set[int]] = [set() for _ in range(self.agents)]
         for sender, receiver in self.index:
             found[receiver].add(sender)
-        return tuple(frozenset(each) for each in found)
+        return tuple(frozenset(senders) for senders in found)

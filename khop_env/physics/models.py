@@ -255,13 +255,13 @@ class SurfaceVessel(AgentModel):
         return math.inf
 
     def explicit_step(self, reach: FloatArray, disturbance: FloatArray) -> float:
-        """0.9 / (drag + turning), in s, at the larger of the velocities at the start and at full force.
+        """0.9 / (drag + turning), in s, at the larger of the initial velocities and those at full force.
 
         At full input and disturbance the velocity settles where drag balances them. Drag, in 1/s, is the largest slope
         of M^-1 D(nu) nu there; turning is the norm of the skew matrix M^-1/2 C(nu) M^-1/2, which turns the momentum
-        without changing the energy. An explicit step adds energy as it turns, and explodes where it adds more than drag
-        takes. The factor is measured: no vessel of a ship's proportions exploded under random, held or energy-raising
-        inputs at their limits. Where neither drag nor a limit is there, the velocities at the start count.
+        without changing the energy. An explicit step adds energy as it turns, and is unstable where it adds more than
+        drag removes. The factor is measured: no vessel of a ship's proportions diverged under random, held or
+        energy-raising inputs at their limits. Without drag and input limits, the initial velocities count.
         """
         mass, linear, quadratic = (np.array(v) for v in (self.mass, self.linear_drag, self.quadratic_drag))
         force = self.input_limit + mass * disturbance[3:]

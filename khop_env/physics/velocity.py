@@ -1,7 +1,7 @@
 """From a commanded velocity to each agent model's own inputs.
 
-Consensus laws and leaders' routes say where an agent's position should go; what it takes to go there depends on the
-model. A model that the library doesn't know gets an entry of its own: `VELOCITY_CONTROLLERS["my_type"] = my_function`.
+Consensus laws and leaders' routes command the velocity of an agent's position; the inputs that realise it depend on the
+model. For a model of your own add an entry: `VELOCITY_CONTROLLERS["my_type"] = my_function`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from khop_env.physics.models import DoubleIntegrator, SurfaceVessel
 
 VelocityController = Callable[..., FloatArray]
 
-VELOCITY_RATE = 2.0  # 1/s: how fast a velocity error is meant to decay where the input is a force or an acceleration
+VELOCITY_RATE = 2.0  # 1/s: decay rate of the velocity error where the input is a force or an acceleration
 OFFSET = 0.3  # m ahead of a unicycle's axle: the point whose velocity is commanded
 
 

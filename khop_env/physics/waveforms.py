@@ -26,7 +26,7 @@ def add_sines(
         drawn: For each environment omega in rad/s, then phi in rad, each (components, C) and flat.
         components: Number of sines j.
         index: Components of the state to add to, shape (C,).
-        amplitude: What all crests add up to, shape (C,).
+        amplitude: Sum of the amplitudes of all sines, shape (C,).
         out: Added to, shape (B, n).
     """
     channels = index.size

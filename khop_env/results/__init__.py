@@ -1,4 +1,4 @@
-"""THE RECORD: trajectories as tidy tables, metrics, figures and design reports."""
+"""Results: recordings of runs, tidy tables, metrics, figures, films and design reports."""
 
 from khop_env.results.assumptions import Assumption, assumptions
 from khop_env.results.curves import error_over_time, learning_curves, set_iss_figure

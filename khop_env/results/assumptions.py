@@ -1,4 +1,4 @@
-"""The paper's six assumptions, looked up in a scenario: which hold, which don't, and why."""
+"""Check of the paper's six assumptions on a scenario: status and reason of each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from khop_env.scenarios import Scenario
 
 Status = Literal["holds", "doesn't hold", "holds by construction", "not known"]
 
-_MARGIN = 1.05  # Assumption 6 is checked for a bound this much above the smallest that delta can ever meet
+_MARGIN = 1.05  # Assumption 6 is checked for an accuracy this factor above the norm of all infima
 
 _DENSE = 1000  # agents: eigenvalues of a dense matrix take seconds beyond
 
@@ -26,10 +26,10 @@ class Assumption:
     """One assumption of the paper.
 
     Attributes:
-        number: as the paper counts them.
-        statement: what it says, in short.
-        status: whether this scenario satisfies it; "not known" where the user's own functions decide.
-        why: the reason, with its numbers.
+        number: number in the paper, e.g. "1-ii".
+        statement: short form of the assumption.
+        status: whether this scenario satisfies it; "not known" if it depends on the user's own functions.
+        why: the reason, with numbers.
     """
 
     number: str
@@ -76,7 +76,7 @@ def _lipschitz_drift(scenario: Scenario) -> Assumption:
         why.append(f"{_listed(unknown)}: no constant declared (drift_lipschitz)")
     blind = [i for i, option in enumerate(scenario.design.options) if not option.drift]
     if blind:
-        why.append(f"observers of {len(blind)} agents do without f (Theorem 2): their motion has to stay bounded")
+        why.append(f"observers of {len(blind)} agents don't use f (Theorem 2): their motion must stay bounded")
     return Assumption("1-i", "each f is locally Lipschitz", "not known" if unknown else "holds", "; ".join(why))
 
 
@@ -86,7 +86,7 @@ def _measurable_input_map(scenario: Scenario) -> Assumption:
         "1-ii",
         "each g is measurable and locally bounded",
         "not known" if own else "holds",
-        f"{_listed(own)}: your own model; any continuous g will do"
+        f"{_listed(own)}: your own model; any continuous g satisfies it"
         if own
         else "the library's input maps are continuous",
     )
@@ -103,7 +103,10 @@ def _bounded_disturbance(scenario: Scenario) -> Assumption:
     why = f"|w| <= {bound.max():.4g} in every component, as declared by {kinds}"
     if own:
         return Assumption(
-            "1-iii", statement, "not known", f"{why}; {_listed(own)}: your own, continuous and within it if you say so"
+            "1-iii",
+            statement,
+            "not known",
+            f"{why}; {_listed(own)}: your own; holds if it is continuous and within the declared bound",
         )
     return Assumption("1-iii", statement, "holds", f"{why}, all continuous")
 
@@ -129,7 +132,7 @@ def _relay(scenario: Scenario) -> Assumption:
     statement = "agents relay their neighbours' states and inputs"
     if scenario.relay:
         return Assumption(
-            "4", statement, "holds by construction", "relay = true: 2-hop observers are handed the true value"
+            "4", statement, "holds by construction", "relay = true: 2-hop observers receive the true value"
         )
     return Assumption(
         "4",
@@ -158,15 +161,15 @@ def _nominal_controller(scenario: Scenario) -> Assumption:
             "5",
             statement,
             "doesn't hold",
-            f"w pushes positions for good ({_listed(sorted(lasting))}), and a law that doesn't know w can't cancel it: "
-            "agents come near the goal set at best. What estimates cost is the excess over the distance that agents "
-            "keep under the true states (compare --observe oracle)",
+            f"w acts on positions permanently ({_listed(sorted(lasting))}), and a law without knowledge of w can't "
+            "cancel it: agents stay at some distance from the goal set. The effect of estimates is the excess over the "
+            "distance under the true states (compare --observe oracle)",
         )
     return Assumption(
         "5",
         statement,
         "not known",
-        "w reaches positions through other states only, or vanishes as agents meet, or is your own: how near they come "
+        "w acts on positions through other states only, or vanishes in agreement, or is your own: the final distance "
         "is measured only (compare --observe oracle)",
     )
 
@@ -179,14 +182,14 @@ def _disturbance_bound(scenario: Scenario) -> FloatArray:
 
 
 def _undisturbed(scenario: Scenario) -> tuple[Status, str]:
-    """Whether the tanh law is known to agree without a disturbance."""
+    """Status and reason: does the tanh law reach agreement without a disturbance?"""
     models = scenario.models
     if not nx.is_connected(scenario.task):
-        return "doesn't hold", "the task graph isn't connected, so that its parts can agree among themselves only"
+        return "doesn't hold", "the task graph isn't connected, so agreement is possible within its components only"
     if len(models) == 1:
-        return "holds", "an agent alone is at its goal"
+        return "holds", "a single agent is in the goal set"
     if scenario.law.name != "tanh":
-        return "not known", f"nothing is known here of the law {scenario.law.name!r}"
+        return "not known", f"no proof is implemented for the law {scenario.law.name!r}"
     if all(isinstance(model, SingleIntegrator) for model in models):
         # u is minus V's gradient, clipped component by component, and V is convex with its minimum at agreement only
         return "holds", (
@@ -208,17 +211,17 @@ def _undisturbed(scenario: Scenario) -> tuple[Status, str]:
 
 
 def _steady_state_bound(scenario: Scenario) -> Assumption:
-    statement = "after a finite time t_x the norm of all delta stays below the accuracy asked for"
+    statement = "after a finite time t_x the norm of all delta stays below the required accuracy"
     states = scenario.design.states
     if not states.layout.size:
-        return Assumption("6", statement, "holds by construction", "nobody is estimated")
-    # how many observers share each row's delta
+        return Assumption("6", statement, "holds by construction", "no agent is estimated")
+    # number of observers with each row's delta
     rows = states.layout.arrays.observers[states.layout.row_target].astype(float)
     floor = float(np.sqrt(rows @ states.delta.infimum() ** 2))
-    own = sorted({type(one).__name__ for one in states.bounds if not isinstance(one, Exponential)})
+    own = sorted({type(bound).__name__ for bound in states.bounds if not isinstance(bound, Exponential)})
     time = None if own else _first_time_below(lambda t: _norm(states, rows, t), _MARGIN * floor)
     if time is None:
-        why = f"whether all come near it is for your own {_listed(own)} to say" if own else "they take more than a year"
+        why = f"convergence to it depends on your own {_listed(own)}" if own else "convergence takes more than a year"
         return Assumption("6", statement, "not known", f"the norm of all infima is {floor:.4g}; {why}")
     return Assumption(
         "6",

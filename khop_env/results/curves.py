@@ -1,4 +1,4 @@
-"""Figures of many episodes: median and spread over time, and ultimate distances against bounds."""
+"""Figures of many episodes: median and spread over time, ultimate distances over bounds, learning curves."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def error_over_time(
         time: (T,) in s.
         errors: (T, E) in `unit` by (policy, observation mode): policies differ in colour and modes in dashes; the
             modes of a single policy in both.
-        path: of the image file.
-        title: of the figure.
-        unit: of the task error.
+        path: path of the image file.
+        title: title of the figure.
+        unit: unit of the task error.
 
     Returns:
         The path.
@@ -51,7 +51,7 @@ def error_over_time(
         axes.set_xlabel("time (s)")
         axes.set_ylabel(f"task error, mean over agents ({unit})")
         figure.suptitle(title, fontsize=10.5, color="#333333")
-        # an entry for each colour and each kind of dashes: rows that coincide, as those of blind policies, need no more
+        # one legend entry per colour and per line style; curves may coincide, e.g. of policies that ignore observations
         entries = [
             Line2D([], [], color=COLORS[number % len(COLORS)], label=policy)
             for number, policy in enumerate(policies)
@@ -78,9 +78,9 @@ def set_iss_figure(
     Args:
         injected: rows of `agents.set_iss.injected_errors`.
         swept: rows of `agents.set_iss.swept_bounds`.
-        path: of the image file.
-        title: of the figure.
-        unit: of positions.
+        path: path of the image file.
+        title: title of the figure.
+        unit: unit of positions.
 
     Returns:
         The path.
@@ -102,7 +102,7 @@ def set_iss_figure(
                 [*bound], [*bound.values()], color="black", linestyle=(0, (5, 2)), label=r"analytical gain $\gamma$"
             )
         left.set_title("(a) Injected errors, no disturbance", loc="left")
-        left.set_xlabel(f"norm of the errors that the law reads ({unit})")
+        left.set_xlabel(f"norm of the errors in the law's arguments ({unit})")
         left.set_ylabel(f"ultimate distance to the goal set ({unit})")
         for color, (observers, disturbed), marker in zip(
             (*COLORS[:3], COLORS[4]),
@@ -122,7 +122,7 @@ def set_iss_figure(
         floors = [row["floor"] for row in swept if row["disturbed"]]
         if floors:
             right.axhline(
-                float(np.mean(floors)), color=COLORS[3], linestyle=(0, (1.5, 1.5)), label="oracle's own floor"
+                float(np.mean(floors)), color=COLORS[3], linestyle=(0, (1.5, 1.5)), label="floor of the oracle"
             )
         right.set_title(r"(b) Estimates, with the bound's final value $\delta(\infty)$ swept", loc="left")
         right.set_xlabel(rf"$\delta(\infty)$ ({unit})")
@@ -143,7 +143,7 @@ def learning_curves(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArr
 
     Args:
         curves: by title, the agent-steps (T,) and by name the mean returns (seeds, T).
-        path: of the image file.
+        path: path of the image file.
 
     Returns:
         The path.

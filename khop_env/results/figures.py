@@ -1,4 +1,4 @@
-"""The paper's three panels: where the agents went, and what was believed of one of them."""
+"""The paper's three-panel figure: trajectories, and estimates of one agent's state and input."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from khop_env.scenarios import Scenario
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# M. Okabe and K. Ito, Color Universal Design, 2008: told apart by colour-blind readers, too; yellow left out (too pale)
+# M. Okabe and K. Ito, Color Universal Design, 2008: distinguishable for colour-blind readers; without yellow (too pale)
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#8C8C8C")
 _ERROR, _DISAGREEMENT = COLORS[0], COLORS[3]
-_MOST_LABELS = 12  # agents told apart in panel (a)
-_MOST_POINTS = 500_000  # in panel (a)
+_MOST_LABELS = 12  # agents with a colour each in panel (a)
+_MOST_POINTS = 500_000  # plotted in panel (a)
 
 
 def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, agent: int | None = None) -> Path:
-    """Draw a run as the paper's figure does, and save it.
+    """Draw a run in the layout of the paper's figure, and save it.
 
-    (a) The agents' positions, from crosses to dots. (b) The largest |estimation error| and |disagreement| over all
-    observers of one agent's state, with their bounds dashed. (c) The same for its input. Where the bounds differ
-    between components, (b) and (c) show the component that came nearest to its bound.
+    (a) The agents' positions, from crosses (initial) to dots (final). (b) The largest |estimation error| and
+    |disagreement| over all observers of one agent's state, with their bounds dashed. (c) The same for its input. Where
+    the bounds differ between components, (b) and (c) show the component with the largest ratio of error to bound.
 
     Args:
-        recording: of the run.
-        scenario: what was run.
-        path: of the image file; its ending decides the format.
-        agent: number of the agent shown in (b) and (c). By default the paper's Agent 4 (here 3) in `paper`, and
-            elsewhere the one with most observers.
+        recording: recording of the run.
+        scenario: scenario of the run.
+        path: path of the image file; its suffix sets the format.
+        agent: index of the agent whose estimates are drawn in (b) and (c). By default the scenario's `figure_agent`, or
+            the agent with most observers if that is None.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: if there is no such agent.
+        ValueError: if there is no agent with this index.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    shown = _default_agent(recording, scenario) if agent is None else recording.fleet.agent(agent)
-    name = recording.fleet.ids[shown]
-    with rc_context(STYLE), np.errstate(all="ignore"):  # of states that ran away, what is finite is drawn
+    target = _default_agent(recording, scenario) if agent is None else recording.fleet.agent(agent)
+    name = recording.fleet.ids[target]
+    with rc_context(STYLE), np.errstate(all="ignore"):  # of a diverged state the finite part is drawn
         figure = Figure(figsize=(13.0, 4.4), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         _draw_positions(left, recording)
-        _draw_observers(middle, recording, recording.states, shown, f"(b) Estimates of the state of {name}")
-        _draw_observers(right, recording, recording.inputs, shown, f"(c) Estimates of the input of {name}")
+        _draw_observers(middle, recording, recording.states, target, f"(b) Estimates of the state of {name}")
+        _draw_observers(right, recording, recording.inputs, target, f"(c) Estimates of the input of {name}")
         figure.suptitle(_headline(recording, scenario), fontsize=10.5, color="#333333")
         figure.savefig(path, dpi=150)
     return Path(path)
@@ -72,20 +72,20 @@ STYLE: Any = {
 
 
 def _default_agent(recording: Recording, scenario: Scenario) -> int:
-    if scenario.name == "paper" and len(recording.fleet) > 3:
-        return 3
+    if scenario.figure_agent is not None:
+        return scenario.figure_agent
     layout = recording.design.states.layout
     return int(layout.target[np.argmax(layout.arrays.observers)]) if len(layout.target) else 0
 
 
 def _headline(recording: Recording, scenario: Scenario) -> str:
     extremes = recording.extremes
-    ratios = float(np.maximum(extremes.normalized, extremes.input_normalized)[0])  # nan if one is
+    ratios = float(np.maximum(extremes.normalized, extremes.input_normalized)[0])  # nan if any is
     over = f"over all {recording.design.states.layout.pairs} pairs"
     if recording.error is not None:
         return f"{scenario.name}: stopped at t = {recording.time[-1]:.4g} s, {_reason(recording)}"
     kept = "inside all funnels" if ratios < 1.0 else "funnels left"
-    digits = f"{ratios:.3f}" if round(ratios, 3) != 1.0 else f"{ratios:.12g}"  # never 1.000 where it isn't 1
+    digits = f"{ratios:.3f}" if round(ratios, 3) != 1.0 else f"{ratios:.12g}"  # never 1.000 for another number
     return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {digits} {over}"
 
 
@@ -111,7 +111,7 @@ def _draw_positions(axes: Axes, recording: Recording) -> None:
         groups = {kind: [i for i, model in enumerate(fleet.models) if model.type == kind] for kind in types}
     for number, (label, members) in enumerate(groups.items()):
         style: Any = {"color": COLORS[number % len(COLORS)], "alpha": 1.0 if few else 0.5}
-        # one broken line for all members: a line each takes minutes in a large fleet
+        # a single broken line for all members: separate lines take minutes in a large fleet
         broken = np.concatenate([path[:, members], np.full((1, len(members), 2), np.nan)]).swapaxes(0, 1).reshape(-1, 2)
         axes.plot(*broken.T, linewidth=1.2 if few else 0.5, label=label, **style)
         axes.plot(*path[0, members].T, "x", markersize=6 if few else 3.5, markeredgewidth=1.6 if few else 0.8, **style)
@@ -131,7 +131,7 @@ def _draw_positions(axes: Axes, recording: Recording) -> None:
 
 
 def _label_starts(axes: Axes, starts: FloatArray, labels: list[str]) -> None:
-    """Write the agents' numbers beside their crosses, on the side that faces away from the others."""
+    """Write the agents' indices beside their crosses, on the side away from the centre."""
     from matplotlib.patheffects import withStroke
 
     outwards = starts - starts.mean(axis=0)
@@ -167,19 +167,19 @@ def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agen
 
     names, units = (list(each) for each in zip(*recording.fleet.models[agent].states.items(), strict=True))
     if np.all(delta == delta[:, :1]):
-        shown, error, disagreement = "max over observers, components", error.max(axis=1), disagreement.max(axis=1)
+        text, error, disagreement = "max over observers, components", error.max(axis=1), disagreement.max(axis=1)
         rho, delta = rho[:, 0], delta[:, 0]
     else:
-        worst = int(np.argmax((error / delta).max(axis=0)))  # one that isn't a number counts as the largest
-        shown = f"{names[worst]}: max over observers"
+        worst = int(np.argmax((error / delta).max(axis=0)))  # nan counts as the largest
+        text = f"{names[worst]}: max over observers"
         units = [units[worst]]
         error, disagreement, rho, delta = (values[:, worst] for values in (error, disagreement, rho, delta))
     letters = (r"\delta", r"\rho") if kind is recording.states else (r"\theta", r"\omega")
-    for values, bound, color, width, what, letter in (
+    for values, bound, color, width, label, letter in (
         (error, delta, _ERROR, 2.0, "|error|", letters[0]),  # wider: the two often coincide
         (disagreement, rho, _DISAGREEMENT, 1.2, "|disagreement|", letters[1]),
     ):
-        axes.plot(kind.time, np.where(values > 0.0, values, np.nan), color=color, linewidth=width, label=f"max {what}")
+        axes.plot(kind.time, np.where(values > 0.0, values, np.nan), color=color, linewidth=width, label=f"max {label}")
         axes.plot(kind.time, bound, color=color, linestyle=(0, (5, 2)), label=f"its bound ${letter}(t)$")
     axes.set_yscale("log")
     low, high = _lowest(error, disagreement, rho), float(delta.max())
@@ -189,12 +189,12 @@ def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agen
     if kind is recording.inputs:
         units = [f"{unit}/s".replace("/s/s", "/s$^2$") for unit in units]
     units = list(dict.fromkeys(units))
-    axes.set_ylabel(f"{shown} ({', '.join(units) if len(units) < 3 else 'SI units'})")
+    axes.set_ylabel(f"{text} ({', '.join(units) if len(units) < 3 else 'SI units'})")
     axes.legend(loc="upper right", ncols=2, fontsize=8.5, handlelength=2.4, columnspacing=1.2)
 
 
 def _lowest(error: FloatArray, disagreement: FloatArray, rho: FloatArray) -> float:
-    """Lower end of the logarithmic axis: dips of a moment and rounding errors don't stretch it over many decades."""
+    """Lower end of the logarithmic axis, so that short dips and rounding errors don't stretch it over many decades."""
     values = np.concatenate([error, disagreement])
     values = values[(values > 0.0) & np.isfinite(values)]
     floor = 1e-6 * float(rho.min())
@@ -202,13 +202,13 @@ def _lowest(error: FloatArray, disagreement: FloatArray, rho: FloatArray) -> flo
 
 
 def _explain_absence(axes: Axes, recording: Recording, agent: int) -> None:
-    """Say in an empty panel why it is empty."""
+    """Write the reason into an empty panel."""
     name, model = recording.fleet.ids[agent], recording.fleet.models[agent]
     if not recording.design.neighborhoods[agent]:
-        why = f"No agent estimates {name}:\nall others hear it, or are too far away."
+        why = f"No agent estimates {name}:\nall others are its neighbours, or more than k hops away."
     elif model.input_map_uses_state:
         why = f"{name} has no input observer:\nits input map g(x, u) depends on its state."
     else:
-        why = f"{name} has no input observer:\nits input counts as a bounded disturbance."
+        why = f"{name} has no input observer:\nits input is treated as a bounded disturbance."
     axes.text(0.5, 0.5, why, ha="center", va="center", transform=axes.transAxes, color="#555555")
     axes.set_axis_off()

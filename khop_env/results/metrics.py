@@ -1,4 +1,4 @@
-"""A recording in a few numbers, as plain JSON."""
+"""Summary of a recording in a few numbers, as plain JSON."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from khop_env.results.recording import Recording, StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe
 
-_ABSURD = 1e6  # times the largest initial state: no task sends agents so far away
+_ABSURD = 1e6  # times the largest initial state; no task leads agents so far away
 
 
 def consensus_error(fleet: Fleet, x: FloatArray) -> FloatArray:
-    """(...,) |Pi p|: how far the agents' positions p are from agreement, in their unit.
+    """(...,) |Pi p|: distance of the agents' positions p from agreement, in their unit.
 
-    Pi subtracts the mean (the paper's disagreement projection), here from the stacked position read-outs, so that mixed
-    fleets have a consensus error too.
+    Pi subtracts the mean (the paper's disagreement projection), applied to the stacked position outputs, so that it is
+    defined for mixed fleets, too.
 
     Args:
         fleet: the agents.
-        x: (..., n) their states.
+        x: (..., n) states of the fleet.
     """
     positions = fleet.positions(x)
-    with np.errstate(over="ignore", invalid="ignore"):  # of states that ran away: inf or nan says it
+    with np.errstate(over="ignore", invalid="ignore"):  # diverged states give inf or nan
         return np.asarray(np.linalg.norm(positions - positions.mean(axis=-2, keepdims=True), axis=(-2, -1)))
 
 
 def _diverged(x: FloatArray) -> bool:
-    """Whether a state grew a million times as large as any at the beginning, and 1 of its unit."""
+    """True if a state exceeds a million times the largest initial state (at least 1)."""
     largest = _ABSURD * max(1.0, float(np.abs(x[0]).max()))
     return not bool(np.all(np.abs(x) <= largest))
 
 
 def finite(value: float) -> float | None:
-    """A number as JSON has it: null where it is infinite or not a number."""
+    """The number as a JSON value: None if it is infinite or nan."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -54,21 +54,21 @@ def summarize(
     controller: str,
     observe: Observe,
 ) -> dict[str, Any]:
-    """The summary of a run.
+    """Summary of a run.
 
-    The two ratios are the paper's guarantee: below 1 over all pairs, components and steps, each disagreement stayed in
-    its funnel and each estimation error within its bound. `funnel_kept` says that they are, for both kinds of
-    observers, and that the run got to its end with every state finite. `diverged` hints at a plant that ran away.
-    Numbers that aren't finite are null.
+    The paper guarantees that two ratios stay below 1 over all pairs, components and steps: the disagreement over its
+    funnel, and the estimation error over its bound. `funnel_kept` is True if they did, for both kinds of observers, and
+    the run reached its end with finite states. `diverged` indicates an unstable closed loop. Numbers that aren't finite
+    are null.
 
     Args:
-        recording: of the run.
-        scenario: what was run.
-        seed: of the initial state and the disturbance.
+        recording: recording of the run.
+        scenario: scenario of the run.
+        seed: seed of the initial state and the disturbance.
         dt: step in s.
-        observers: how they were stepped.
+        observers: realisation of the observers.
         controller: name of the feedback law.
-        observe: what the law read of agents beyond its neighbours.
+        observe: information of the law on k-hop targets: estimates, true states, or none.
     """
     extremes = recording.extremes
     state_ratios = [extremes.normalized[0], extremes.relative[0]]

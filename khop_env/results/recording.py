@@ -1,4 +1,4 @@
-"""One simulated episode, sampled: what tables, metrics and figures are made from."""
+"""Recording of a simulated episode: samples for tables, metrics and figures."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.observers import Extremes, FloatArray, FunnelBank, FunnelError, Funnels, ObserverDesign, SolveError
 from khop_env.physics import Fleet
 from khop_env.scenarios.scenario import number_of_steps
 from khop_env.simulation import Simulator
 
 Progress = Callable[[float], None]
-"""Called now and then with the fraction of the episode that is done."""
+"""Called repeatedly with the completed fraction, from 0 to 1."""
 
 MOST_ROWS = 5_000_000
-"""Samples times estimates that a recording may hold (40 MB an array): larger fleets are sampled less often."""
+"""Limit on samples times estimates of a recording (40 MB per array); larger fleets are sampled less often."""
 
 _TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.07000000000000001
 
@@ -35,10 +36,10 @@ class ObserverRecord:
     """The samples of one kind of observer: of the states (PPSO), or of the inputs' effects g (PPIO).
 
     Attributes:
-        funnels: who estimates whom, and within which bounds; P estimates in the order of `funnels.layout`.
+        funnels: observer-target pairs and bounds; the P estimates are in the order of `funnels.layout`.
         time: (T,) in s.
-        truth: (T, n) what is estimated: the fleet's x, or its g.
-        estimate: (T, P).
+        truth: (T, n) true values: the fleet's x, or its g.
+        estimate: (T, P) estimates.
         disagreement: (T, P) xi, or mu.
     """
 
@@ -48,25 +49,27 @@ class ObserverRecord:
     estimate: FloatArray
     disagreement: FloatArray
 
+    __repr__ = brief
+
     @property
     def truth_per_estimate(self) -> FloatArray:
-        """(T, P) the true value of what each estimate is an estimate of."""
+        """(T, P) the true value of each estimated component."""
         return self.truth[:, self.funnels.layout.column_source]
 
     @property
     def error(self) -> FloatArray:
         """(T, P) estimation errors x_tilde, or g_tilde."""
-        with np.errstate(invalid="ignore"):  # inf - inf, of states that ran away, is nan
+        with np.errstate(invalid="ignore"):  # inf - inf, of diverged states, is nan
             return self.estimate - self.truth_per_estimate
 
     @property
     def rho(self) -> FloatArray:
-        """(T, P) funnels on the disagreements: rho, or omega."""
+        """(T, P) funnels of the disagreements: rho, or omega."""
         return self._evaluate(self.funnels.rho)
 
     @property
     def delta(self) -> FloatArray:
-        """(T, P) bounds on the errors: delta, or theta."""
+        """(T, P) bounds on the estimation errors: delta, or theta."""
         return self._evaluate(self.funnels.delta)
 
     def _evaluate(self, bank: FunnelBank) -> FloatArray:
@@ -76,19 +79,19 @@ class ObserverRecord:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Samples of one episode in one environment, and what was seen at every step between them.
+    """Samples of one episode in one environment, with extremes over all steps.
 
     Attributes:
-        design: fleet, graph and observers.
+        design: design of the observers, with fleet and graph.
         x: (T, n) states.
         u: (T, m) inputs.
-        states: what the state observers did.
-        inputs: what the input observers did; of width 0 where there are none.
-        extremes: the largest ratios over ALL steps, sampled or not; arrays of shape (1,).
+        states: samples of the state observers.
+        inputs: samples of the input observers; P = 0 if there are none.
+        extremes: largest ratios over all steps, also those between samples; arrays of shape (1,).
         steps: number of steps taken.
-        wall_time: seconds spent stepping and sampling; not in compiling.
-        error: why the episode ended early, or None. Everything up to then is here.
-        task_error: (T,) the team's mean task error, where an environment's task was played; otherwise None.
+        wall_time: seconds of stepping and sampling, without compilation.
+        error: the exception that ended the episode early, or None; samples until then are kept.
+        task_error: (T,) mean task error of the team; None without an environment's task.
     """
 
     design: ObserverDesign
@@ -102,6 +105,10 @@ class Recording:
     error: Failure | None = None
     task_error: FloatArray | None = None
 
+    def __repr__(self) -> str:
+        samples = f"{len(self.time)} samples of {self.steps} steps to t = {self.time[-1]:g} s"
+        return f"Recording({self.design}; {samples}{'' if self.error is None else ', ended early'})"
+
     @property
     def fleet(self) -> Fleet:
         """The agents."""
@@ -109,12 +116,12 @@ class Recording:
 
     @property
     def time(self) -> FloatArray:
-        """(T,) time of each sample in s: 0, then at most so many a second as were asked for, then the end."""
+        """(T,) sample times in s: 0, at most `samples_per_second` per second, and the final time."""
         return self.states.time
 
     @property
     def completed(self) -> bool:
-        """Whether the episode ran to its end."""
+        """True if the episode reached its end."""
         return self.error is None
 
 
@@ -128,29 +135,29 @@ def record(
     ended: Callable[[], bool] | None = None,
     progress: Progress | None = None,
 ) -> Recording:
-    """Run the simulator from where it stands to `duration`, and keep samples of everything.
+    """Run the simulator from its current time to `duration`, and record samples.
 
-    Step k ends at k dt, however many went before it (no drift), and the last one is shortened to end at `duration`.
+    Step k ends at exactly k dt (no accumulated rounding), and the last step is shortened to end at `duration`.
 
     Args:
-        simulator: of one environment, just reset, and with a law.
-        duration: s.
+        simulator: simulator of one environment, just reset, with a law.
+        duration: final time in s.
         dt: step in s.
-        samples_per_second: at most this many; fewer where the steps are longer, or the fleet is so large that more
-            than `MOST_ROWS` numbers would be kept in an array.
-        task_error: sampled, too, if given: the error of the task that is played.
-        ended: whether the episode is over before its time, asked after every step.
-        progress: called now and then with how far it is.
+        samples_per_second: upper limit; there are fewer if steps are longer, or if an array would hold more than
+            `MOST_ROWS` numbers.
+        task_error: returns the current error of the environment's task, to be sampled; or None.
+        ended: returns whether the episode is over before its time, after every step; or None.
+        progress: called repeatedly with the completed fraction.
 
     Returns:
-        The recording. Where the integrator gave up midway, `Recording.error` says why, and all samples before stand.
+        The recording. If a step fails, `Recording.error` holds the exception, and earlier samples are kept.
 
     Raises:
-        ValueError: for more than one environment, or a duration or step that isn't positive and finite, or too short
-            or long for the other.
+        ValueError: if the simulator has several environments, or duration or step isn't positive and finite, or there
+            would be too many steps.
     """
     if simulator.num_envs != 1:
-        raise ValueError(f"one environment is recorded at a time; the simulator has num_envs={simulator.num_envs}")
+        raise ValueError(f"expected a simulator of one environment; got num_envs={simulator.num_envs}")
     steps = number_of_steps(duration, dt)
     if not 0.0 < samples_per_second < math.inf:
         raise ValueError(f"samples_per_second must be positive and finite; got {samples_per_second!r}")
@@ -160,9 +167,9 @@ def record(
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
     samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error)
     error: Failure | None = None
-    with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError does, and a summary says what ran away
+    with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError and the summary do
         simulator.warm_up()
-        start = shown = clock.perf_counter()
+        start = reported = clock.perf_counter()
         samples.take()
         done = 0
         try:
@@ -175,10 +182,10 @@ def record(
                     samples.take()
                 if over:
                     break
-                if progress is not None and (now := clock.perf_counter()) - shown > 0.1:
-                    shown = now
+                if progress is not None and (now := clock.perf_counter()) - reported > 0.1:
+                    reported = now
                     progress(k / steps)
-        except (FunnelError, SolveError, StoppedError) as stopped:  # the state is the one before the step
+        except (FunnelError, SolveError, StoppedError) as stopped:  # the state before the failed step is kept
             error = stopped
             if done % stride:
                 samples.take()
@@ -189,7 +196,7 @@ def record(
 
 
 class _Samples:
-    """Arrays for all samples of an episode, filled one by one."""
+    """Arrays for all samples of an episode."""
 
     def __init__(self, simulator: Simulator, count: int, task_error: Callable[[], float] | None) -> None:
         self._simulator = simulator

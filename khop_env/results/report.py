@@ -1,4 +1,4 @@
-"""The design report: what a control engineer wants to know before running, as plain JSON."""
+"""The design report: properties of a scenario's observers before a run, as plain JSON."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 from khop_env.observers import DesignError, Exponential, FloatArray, Funnels, ObserverDesign, PerformanceFunction
 from khop_env.results.assumptions import assumptions
 from khop_env.scenarios import Scenario
-from khop_env.simulation.simulator import parts_of_step
+from khop_env.simulation.plant import parts_of_step
 
 
 def design_report(scenario: Scenario) -> dict[str, Any]:
-    """Everything that the observers of a scenario rest on.
+    """Design report of a scenario: feasibility, targets, bounds and the paper's assumptions.
 
     Returns:
-        feasible: whether every condition of the observers holds that can be checked before the start; `error` says
-            which doesn't.
-        targets: per agent that is estimated: its k-hop set, eta, lambda_min and lambda_max of M_i, and under `state`
-            and `input` per group of components with equal numbers: delta and rho (theta and omega), each with its
-            value at 0 and at infinity and its rate, and start_share, the largest |xi(0)| / rho(0) over the initial
-            set; null where |g| is unbounded, so that only `Simulator.reset` can tell.
-        pairs: of observer and target; estimates: numbers that they estimate.
-        explicit_step_bound_s: no explicit Euler step longer than this is stable at steady state (it has to be far
+        feasible: True if all conditions of the observers that can be checked before the start hold; otherwise `error`
+            names the violated condition.
+        targets: per estimated agent: its k-hop set, eta, lambda_min and lambda_max of M_i, and under `state` and
+            `input` per group of components with equal bounds: delta and rho (theta and omega), each with initial and
+            final value and rate, and start_share, the largest |xi(0)| / rho(0) over the initial set; null if |g| is
+            unbounded, so that only `Simulator.reset` can check it.
+        pairs: number of observer-target pairs; estimates: number of estimated components.
+        explicit_step_bound_s: upper bound on stable explicit Euler steps at steady state (accurate steps are far
             shorter): the smallest over all targets, for both kinds of observers.
-        assumptions: the paper's six, each with a status and why.
+        assumptions: the paper's six assumptions, each with status and reason.
 
-    Numbers that are infinite or unknown are null. All keys are there in any case: where the observers can't be
-    designed at all, what follows from a design is null, and targets and assumptions are empty.
+    Infinite or unknown numbers are null. All keys are always present: if the observers can't be designed, results of
+    the design are null, and targets and assumptions are empty.
     """
     report: dict[str, Any] = {
         "scenario": scenario.name,
@@ -58,7 +58,7 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         report |= {"plant_step_s": longest, "plant_agent": scenario.fleet.ids[agent]}
     bound = scenario.fleet.input_map_bound
     radius = {"state": scenario.initial.radius, "input": bound}
-    try:  # as the simulator does: where g is unbounded, its reset checks where the inputs start
+    try:  # as the simulator does: its reset checks the initial inputs where g is unbounded
         design.require_feasible_start(scenario.initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         parts_of_step(scenario.dt, longest, scenario.fleet.ids[agent])
         _require_digits(scenario)
@@ -76,22 +76,23 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         for target, groups in _funnel_groups(design, funnels, share, *_LETTERS[kind]).items():
             targets[target][kind] = groups
     report["targets"] = list(targets.values())
-    report["assumptions"] = [vars(one) for one in assumptions(scenario)]
+    report["assumptions"] = [vars(assumption) for assumption in assumptions(scenario)]
     return report
 
 
-_DIGITS = 4.0  # units in the last place of an estimate that rho has to exceed, for each link of its observer
-_REGION = 10.0  # states are taken to stay within this many times the initial set
+_DIGITS = 4.0  # rho must exceed this many units in the last place of an estimate per link of its observer
+_REGION = 10.0  # states are assumed to stay within this multiple of the initial set
 
 
 def _require_digits(scenario: Scenario) -> None:
-    """Refuse bounds that floating point can't keep: an estimate is rounded to a unit in its last place.
+    """Check that bounds are large enough for floating point: estimates have errors of a unit in the last place.
 
-    A disagreement adds up as many differences of estimates as its observer has links, d_a, each off by a unit or so.
-    States are taken to stay within `_REGION` times the initial set, or as far as inputs and disturbances drive them.
+    A disagreement is a sum of d_a differences of estimates, one per link of its observer, each with such an error.
+    States are assumed to stay within `_REGION` times the initial set, or as far as inputs and disturbances drive them.
 
     Raises:
-        DesignError: naming agent, component and the smallest delta (theta) at infinity that can be kept there.
+        DesignError: if one isn't; the message names agent, component and the smallest admissible delta (theta) at
+            infinity.
     """
     fleet, design = scenario.fleet, scenario.design
     reach = np.abs(scenario.initial.center) + scenario.initial.radius
@@ -108,13 +109,13 @@ def _require_digits(scenario: Scenario) -> None:
         rho = funnels.rho.infimum()
         row = int(np.argmax(needed / rho))
         if rho[row] < needed[row]:
-            who, name, unit = fleet.component_names()[layout.row_source[row]]
-            what, unit = (name, unit) if kind == "state" else (f"input effect on {name}", f"{unit}/s")
+            agent, name, unit = fleet.component_names()[layout.row_source[row]]
+            quantity, unit = (name, unit) if kind == "state" else (f"input effect on {name}", f"{unit}/s")
             raise DesignError(
-                f"{bound}(inf) = {funnels.delta.infimum()[row]:.3g} of {who!r}, component {name!r}, is too small for "
-                f"floating point: where the {what} may be {largest[row]:.3g} {unit}, {funnel}(inf) = {rho[row]:.3g} "
-                f"has to exceed {_DIGITS * links[row]:g} units in its last place, {needed[row]:.3g}; take {bound}(inf) "
-                f"above {1.05 * needed[row] / funnels.gain[row]:.2g}"
+                f"{bound}(inf) = {funnels.delta.infimum()[row]:.3g} of {agent!r}, component {name!r}, is too small for "
+                f"floating point: where the {quantity} may be {largest[row]:.3g} {unit}, {funnel}(inf) = "
+                f"{rho[row]:.3g} must exceed {_DIGITS * links[row]:g} units in its last place, {needed[row]:.3g}; take "
+                f"{bound}(inf) above {1.05 * needed[row] / funnels.gain[row]:.2g}"
             )
 
 
@@ -145,7 +146,7 @@ def _targets(design: ObserverDesign) -> dict[int, dict[str, Any]]:
 def _funnel_groups(
     design: ObserverDesign, funnels: Funnels, share: FloatArray, bound_name: str, funnel_name: str
 ) -> dict[int, list[dict[str, Any]]]:
-    """Per target: its components, those with equal bounds together."""
+    """Per target: its components, grouped by equal bounds."""
     layout = funnels.layout
     described: dict[tuple[Hashable, float], dict[str, Any]] = {}
     targets: dict[int, list[dict[str, Any]]] = {}
@@ -154,7 +155,7 @@ def _funnel_groups(
         groups: dict[Hashable, dict[str, Any]] = {}
         for row, component in zip(range(first, first + n), design.fleet.models[i].states, strict=True):
             bound = funnels.bounds[row]
-            same = bound if isinstance(bound, Exponential) else id(bound)  # a user's own need not be hashable
+            same = bound if isinstance(bound, Exponential) else id(bound)  # a user's own function need not be hashable
             key = same, float(funnels.gain[row])
             if key not in described:
                 described[key] = {bound_name: _numbers(bound), funnel_name: _numbers(funnels.rho.functions[row])}

@@ -16,20 +16,20 @@ QUANTITIES = ("state", "input")
 
 
 def estimates_table(recording: Recording) -> pl.DataFrame:
-    """What every observer believed: one row per (quantity, time, target, observer, component).
+    """Estimates of all observers: one row per (quantity, time, target, observer, component).
 
     Columns:
         quantity: "state" for x_i and the state observers, "input" for g_i and the input observers.
-        time: s.
-        target: id of the agent that is estimated.
-        observer: id of the agent that estimates it.
-        component: name of the state component; g_i has the components of x_i' and their names.
+        time: time in s.
+        target: id of the estimated agent.
+        observer: id of the estimating agent.
+        component: name of the state component; components of g_i have the names of those of x_i.
         state: the true value, of x_i or of g_i(x_i, u_i).
-        estimate: the observer's.
+        estimate: the observer's estimate.
         error: estimate - state.
         disagreement: xi, or mu for inputs.
-        rho: the funnel on the disagreement; omega for inputs.
-        delta: the bound on the error; theta for inputs.
+        rho: the funnel of the disagreement; omega for inputs.
+        delta: the bound on the estimation error; theta for inputs.
     """
     import polars as pl
 
@@ -38,14 +38,14 @@ def estimates_table(recording: Recording) -> pl.DataFrame:
 
 
 def states_table(recording: Recording) -> pl.DataFrame:
-    """What every agent did: one row per (time, agent, component), for state components first and inputs after them.
+    """Trajectories of all agents: one row per (time, agent, component), state components first, then inputs.
 
     Columns:
-        time: s.
-        agent: its id.
+        time: time in s.
+        agent: id of the agent.
         component: name of the state or of the input.
-        x: value of a state; null in rows of inputs.
-        u: value of an input; null in rows of states.
+        x: value of the state; null in rows of inputs.
+        u: value of the input; null in rows of states.
     """
     import polars as pl
 
@@ -92,7 +92,7 @@ def _estimates(recording: Recording, quantity: str, kind: ObserverRecord) -> pl.
 
 
 def _labels(values: Sequence[str], categories: Sequence[str], times: int) -> Any:
-    """`values`, repeated, as an enumeration: a few bytes a row instead of a string."""
+    """`values`, repeated, as an enumeration: a few bytes per row instead of a string."""
     import polars as pl
 
     once = pl.Series(values, dtype=pl.Enum(list(categories)))

@@ -1,4 +1,4 @@
-"""A recording as a film: the frames that the environment renders, in an .mp4 or .gif file."""
+"""A recording as a film: frames of the environment's renderer in an .mp4 or .gif file."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.env import BatchedEnv
+from khop_env.extras import how_to_install
 from khop_env.results.metrics import consensus_error
 from khop_env.results.recording import ObserverRecord, Progress, Recording
 from khop_env.scenarios import Scenario
@@ -26,27 +27,27 @@ if TYPE_CHECKING:
     from khop_env.env.rendering import Renderer
 
 SIZES = {".mp4": (900, 720), ".gif": (720, 576)}
-"""Width and height in pixels by ending; even, as H.264 wants them."""
+"""Width and height in pixels by suffix; even, as H.264 requires."""
 
 _PACKAGES = {".mp4": ("pygame", "imageio_ffmpeg"), ".gif": ("pygame", "PIL")}
 
 
 def require_video(path: str | Path) -> None:
-    """Make sure that a film can be written, before there is something to film.
+    """Check before a run that a film can be written.
 
     Args:
-        path: of the file; its ending decides the format.
+        path: path of the file; its suffix sets the format.
 
     Raises:
-        ValueError: for another ending than .mp4 and .gif.
+        ValueError: if the suffix isn't .mp4 or .gif.
         ModuleNotFoundError: if a package is missing; the message says what to install.
     """
     ending = Path(path).suffix.lower()
     if ending not in SIZES:
-        raise ValueError(f"{path}: a video's name ends in {' or '.join(SIZES)}; got {ending or 'no ending'!r}")
+        raise ValueError(f"{path}: a video's name must end in {' or '.join(SIZES)}; got {ending or 'no suffix'!r}")
     missing = [name for name in _PACKAGES[ending] if importlib.util.find_spec(name) is None]
     if missing:
-        raise ModuleNotFoundError(f"{path}: videos need {' and '.join(missing)}: pip install 'khop_env[render]'")
+        raise ModuleNotFoundError(f"{path}: videos need {' and '.join(missing)}: {how_to_install('render')}")
     if ending == ".mp4":
         _ffmpeg()
 
@@ -62,30 +63,30 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Film a run: agents, edges, and one agent's estimates of those beyond its neighbours.
+    """Write a film of a run: agents, edges, and one agent's estimates of its k-hop targets.
 
-    The film has `fps` frames for each second it lasts, each showing the sample that is nearest in time, and the
-    last one the end. Where the recording has fewer samples a second, some are shown twice.
+    Each frame shows the sample nearest in time, the last frame the final sample. With fewer samples per second than
+    frames, samples repeat.
 
     Args:
-        recording: of the run.
-        scenario: what was run.
-        path: of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
-        observer: id or index of the agent whose estimates are drawn; by default the one with most task edges to
-            agents beyond its neighbours.
-        env: the environment that was played, for its task and the mean of its task error; by default agreement along
-            the scenario's task graph, with the consensus error |Pi p|.
+        recording: recording of the run.
+        scenario: scenario of the run.
+        path: path of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
+        observer: id or index of the agent whose estimates are drawn; by default the agent with most task edges to
+            agents that aren't its neighbours.
+        env: the environment of the run, for its task and task error; None for agreement along the scenario's
+            task graph, and the consensus error |Pi p|.
         fps: frames per second, up to 50.
-        speed: seconds of the run per second of the film.
-        progress: called now and then with how far it is.
+        speed: simulated seconds per second of the film.
+        progress: called with the completed fraction.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: for a wrong ending, observer, fps or speed.
+        ValueError: if suffix, observer, fps or speed is invalid.
         ModuleNotFoundError: if a package is missing; the message says what to install.
-        OSError: if the file can't be written; nothing is left in its place.
+        OSError: if the file can't be written; no partial file is left.
     """
     require_video(path)
     from khop_env.env.rendering import Renderer
@@ -93,16 +94,16 @@ def write_video(
     path = Path(path)
     if not (1 <= fps <= 50 and 0.0 < speed < np.inf):
         raise ValueError(f"expected fps from 1 to 50 and a positive, finite speed; got fps={fps!r}, speed={speed!r}")
-    shown = None if observer is None else recording.fleet.agent(observer)
+    index = None if observer is None else recording.fleet.agent(observer)
     size = SIZES[path.suffix.lower()]
     if env is None:
         edges = directed(scenario.task)
         renderer = Renderer(
-            recording.design, edges, observer=shown, title=scenario.name, error_label="consensus error", size=size
+            recording.design, edges, observer=index, title=scenario.name, error_label="consensus error", size=size
         )
     else:
         title = f"{env.task.name} on {scenario.name}"
-        renderer = Renderer.of(env.task, env.world, observer=shown, title=title, size=size)
+        renderer = Renderer.of(env.task, env.world, observer=index, title=title, size=size)
     samples = _samples(recording, fps / speed)
     frames = _frames(renderer, recording, env, samples, progress)
     try:
@@ -119,7 +120,7 @@ def write_video(
 
 
 def _samples(recording: Recording, per_second: float) -> list[int]:
-    """Indices of the samples nearest to 0, 1, 2, ... frames' time; the last frame shows the last sample."""
+    """Indices of the samples nearest to the frames' times; the last frame has the last sample."""
     time = recording.time
     wanted = time[0] + np.arange(max(1, round((time[-1] - time[0]) * per_second))) / per_second
     wanted[-1] = time[-1]
@@ -148,7 +149,7 @@ def _frames(
 
 
 def _largest_ratio(kind: ObserverRecord, sample: int) -> float:
-    """Largest |disagreement| / funnel of one kind of observer in one sample; 0 if there are none."""
+    """Largest |disagreement| / funnel of one kind of observer in one sample; 0 without observers."""
     layout = kind.funnels.layout
     funnels = kind.funnels.rho.evaluate(kind.time[[sample]], np.empty((layout.rows, 1)))
     return float(np.max(np.abs(kind.disagreement[sample]) / funnels[layout.column_row, 0], initial=0.0))
@@ -157,13 +158,13 @@ def _largest_ratio(kind: ObserverRecord, sample: int) -> float:
 def _write_mp4(path: Path, frames: Iterator[NDArray[np.uint8]], fps: int) -> None:
     first = next(frames)
     height, width, _ = first.shape
-    taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
-    given = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", str(path.resolve())]
-    command = [_ffmpeg(), "-loglevel", "error", "-y", *taken, *given]
-    with tempfile.TemporaryFile() as said:
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
+    target = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart", str(path.resolve())]
+    command = [_ffmpeg(), "-loglevel", "error", "-y", *source, *target]
+    with tempfile.TemporaryFile() as log:
         with (
-            contextlib.suppress(BrokenPipeError),  # it gave up, and says why
-            subprocess.Popen(command, stdin=subprocess.PIPE, stderr=said) as process,
+            contextlib.suppress(BrokenPipeError),  # ffmpeg has ended; its message is in the log
+            subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as process,
         ):
             assert process.stdin is not None
             try:
@@ -173,31 +174,31 @@ def _write_mp4(path: Path, frames: Iterator[NDArray[np.uint8]], fps: int) -> Non
                 process.kill()
                 raise
         if process.returncode:
-            said.seek(0)
-            raise OSError(f"ffmpeg: {said.read().decode(errors='replace').strip() or process.returncode}")
+            log.seek(0)
+            raise OSError(f"ffmpeg: {log.read().decode(errors='replace').strip() or process.returncode}")
 
 
 def _ffmpeg() -> str:
-    """Path of the program.
+    """Path of the ffmpeg program.
 
     Raises:
-        ModuleNotFoundError: if there is none for this machine.
+        ModuleNotFoundError: if it isn't available on this machine.
     """
     from imageio_ffmpeg import get_ffmpeg_exe
 
     try:
         return str(get_ffmpeg_exe())
     except RuntimeError as error:
-        raise ModuleNotFoundError(f"videos in .mp4 need ffmpeg, or take .gif: {error}") from None
+        raise ModuleNotFoundError(f"videos in .mp4 need ffmpeg; .gif doesn't: {error}") from None
 
 
 def _write_gif(path: Path, frames: Iterator[NDArray[np.uint8]], fps: int, colors: NDArray[np.uint8]) -> None:
-    """`colors` is a picture that all frames take their palette from: what doesn't change isn't stored again."""
+    """Write frames with the palette of the image `colors`; a common palette keeps unchanged pixels out of the file."""
     from PIL import Image
 
     palette = Image.fromarray(colors).quantize(256, Image.Quantize.MAXCOVERAGE)
     entries = np.array(palette.getpalette()).reshape(-1, 3)
-    entries[entries.min(axis=1) > 247] = 255  # the ground stays white
+    entries[entries.min(axis=1) > 247] = 255  # the background stays white
     palette.putpalette(entries.ravel().tolist())
     pictures = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     next(pictures).save(path, save_all=True, append_images=pictures, duration=round(100 / fps) * 10, loop=0)

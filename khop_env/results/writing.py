@@ -1,4 +1,4 @@
-"""A run's files on disk."""
+"""Write the files of a run."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from khop_env.scenarios import Scenario
 
 
 class RunFileError(OSError):
-    """Some of a run's files couldn't be written; the message says which, and why.
+    """Some files of a run couldn't be written; the message says which and why.
 
     Attributes:
-        written: The paths of those that were.
+        written: paths of the files that were written.
     """
 
     def __init__(self, message: str, written: dict[str, Path]) -> None:
@@ -29,21 +29,21 @@ class RunFileError(OSError):
 def write_run(
     recording: Recording, scenario: Scenario, summary: Mapping[str, Any], folder: str | Path
 ) -> dict[str, Path]:
-    """Write `states.parquet`, `estimates.parquet`, `summary.json` and `figure.png`, over those of an earlier run.
+    """Write `states.parquet`, `estimates.parquet`, `summary.json` and `figure.png`, replacing those of an earlier run.
 
-    One that fails doesn't keep the others from being written, and none of an earlier run's stays in its place.
+    If a file can't be written, the others still are, and no file of an earlier run stays in its place.
 
     Args:
-        recording: of the run.
-        scenario: what was run.
-        summary: as `summarize` makes it.
-        folder: made if it isn't there.
+        recording: recording of the run.
+        scenario: scenario of the run.
+        summary: summary from `summarize`.
+        folder: folder of the files; created if it doesn't exist.
 
     Returns:
-        The path of each file by its name without the ending.
+        The path of each file, by its name without suffix.
 
     Raises:
-        RunFileError: if some couldn't be written, after all others were.
+        RunFileError: if files couldn't be written, after all others were.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def write_run(
         path = folder / name
         try:
             write(path)
-        except Exception as error:  # whatever went wrong, the other files must not be lost
+        except Exception as error:  # whatever the error, the other files must not be lost
             failures.append(f"{path} ({str(error) or type(error).__name__})")
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""THE ASSEMBLY: one file, one named problem."""
+"""Scenarios: named problems, one file each, and scenario files on disk."""
 
 from khop_env.scenarios.convoy import convoy
 from khop_env.scenarios.mixed_fleet import mixed_fleet

@@ -1,4 +1,4 @@
-"""A scenario written as a TOML file that a newcomer can edit; `khop_env.scenarios.files` reads it back."""
+"""A scenario as a TOML file with comments, to edit; `khop_env.scenarios.files` reads it back."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def write_scenario(scenario: Scenario) -> str:
     """The scenario as the text of a TOML file, with a comment on every section.
 
     Raises:
-        ValueError: if it holds something that a file can't name: an agent model, disturbance or performance function
-            of the user's own.
+        ValueError: if it has an agent model, disturbance or performance function of the user's own, which a file
+            can't represent.
     """
     document = tomlkit.document()
     for line in (
@@ -40,9 +40,12 @@ def write_scenario(scenario: Scenario) -> str:
         ("duration", "s"),
         ("dt", "s, step of the proximal integrator"),
         ("order", "its order, 1 or 2"),
+        ("figure_agent", "index of the agent whose estimates figures show"),
     ):
-        value = tomlkit.item(_plain(getattr(scenario, name)))
-        document.add(name, value.comment(comment) if comment else value)
+        content = getattr(scenario, name)
+        if content is not None:
+            value = tomlkit.item(_plain(content))
+            document.add(name, value.comment(comment) if comment else value)
 
     agents = tomlkit.aot()
     for first, stop in _runs(scenario):
@@ -53,15 +56,20 @@ def write_scenario(scenario: Scenario) -> str:
         agents,
         "The agents: each table adds `count` of one model, with its parameters. They start anywhere within",
         "initial_radius of initial_center: a number, one per state, or a list of these, one for each agent.",
-        "drift_known = false: observers do without the agent's f (Theorem 2). input_observer = false: without g.",
+        "drift_known = false: its observers don't use f (Theorem 2). input_observer = false: they don't estimate g.",
         f"Models: {', '.join(MODELS)}.",
     )
-    _section(document, "communication", _edges(scenario.communication), "Who hears whom. The graph must be connected.")
+    _section(
+        document,
+        "communication",
+        _edges(scenario.communication),
+        "The communication graph, which must be connected: an edge joins two neighbours.",
+    )
     _section(
         document,
         "task",
         _edges(scenario.task),
-        "Who should agree with whom. Both ends must be within k hops of each other.",
+        "The task graph: pairs of agents that should agree, within k hops of each other.",
     )
     _section(
         document,
@@ -114,7 +122,7 @@ def _agents(scenario: Scenario, first: int, stop: int) -> Table:
     if MODELS.get(model.type) is not type(model):
         raise ValueError(
             f"agent {agent!r} can't be written to a file: its model {type(model).__name__} isn't one of the library's "
-            f"({', '.join(MODELS)}), so that nobody could read it back; keep this scenario in Python"
+            f"({', '.join(MODELS)}), so that it couldn't be read back; keep this scenario in Python"
         )
     table = tomlkit.table()
     table.add("model", model.type)
@@ -164,13 +172,13 @@ def _bounds(scenario: Scenario, bounds: Any, name: str) -> Table:
 
 
 def _exponentials(bound: Bound, whose: str) -> dict[str, Any]:
-    several = list(bound) if isinstance(bound, Sequence) else [bound]
-    for one in several:
-        if not isinstance(one, Exponential):
+    functions = list(bound) if isinstance(bound, Sequence) else [bound]
+    for function in functions:
+        if not isinstance(function, Exponential):
             raise ValueError(
-                f"{whose} can't be written to a file: {one!r} isn't an Exponential; keep this scenario in Python"
+                f"{whose} can't be written to a file: {function!r} isn't an Exponential; keep this scenario in Python"
             )
-    values = {name: [float(getattr(one, name)) for one in several] for name in ("initial", "final", "rate")}
+    values = {name: [float(getattr(function, name)) for function in functions] for name in ("initial", "final", "rate")}
     return {name: row[0] if len(set(row)) == 1 else row for name, row in values.items()}
 
 
@@ -198,9 +206,9 @@ def _lines(rows: Sequence[Any], per_line: int) -> Array:
 
 
 def _plain(value: Any) -> Any:
-    """NumPy numbers and tuples as what TOML has: numbers, lists, tables."""
+    """NumPy numbers and tuples as TOML types: numbers, lists, tables."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: _plain(entry) for key, entry in value.items()}
+    return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""Scenarios as TOML files that people write and edit. `write_scenario` shows the format, with comments."""
+"""Scenarios as TOML files. `write_scenario` writes the format, with comments."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from khop_env.physics import (
     did_you_mean,
     validate_graph,
 )
-from khop_env.scenarios.checked import REQUIRED, CheckedTable, NotedError, ScenarioFileError, fits, shown
+from khop_env.scenarios.checked import REQUIRED, CheckedTable, NotedError, ScenarioFileError, abbreviated, fits
 from khop_env.scenarios.export import write_scenario
 from khop_env.scenarios.scenario import MOST_AGENTS, Bounds, LawChoice, Scenario
 
 __all__ = ["ScenarioFileError", "read_scenario", "write_scenario"]
 
 AUTO = "auto"
-"""Stands for the initial value of a bound that the initial set asks for: `Scenario.sized`."""
+"""Value of `initial` for a bound that is sized from the initial set, by `Scenario.sized`."""
 
 _LARGEST_FILE = 2**26  # bytes
 _ABSENT: Any = object()
@@ -46,11 +46,11 @@ def read_scenario(path: str | Path, *, laws: Iterable[str] | None = None) -> Sce
 
     Args:
         path: of the file.
-        laws: names of the feedback laws there are, to refuse others; not checked if left out.
+        laws: names of the known feedback laws; not checked if left out.
 
     Raises:
-        ScenarioFileError: if it can't be read or describes no scenario: the message names the file and the key, what
-            was got, what was expected, and the nearest valid name.
+        ScenarioFileError: if it can't be read or describes no scenario: the message has file and key, the
+            value, the expected value, and the closest valid name.
     """
     path = Path(path)
     try:
@@ -75,6 +75,7 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
         "description": root.take("description", str, ""),
         "k": root.take("k", int),
         **{key: root.take(key, type(defaults[key]), defaults[key]) for key in ("relay", "duration", "dt", "order")},
+        "figure_agent": root.take("figure_agent", int, None),
     }
     k = values["k"]
     if k is not REQUIRED and k < (2 if values["relay"] else 1):
@@ -90,7 +91,7 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
         disturbances = root.tables("disturbance", [])
     with root.gathering():
         values["law"] = _law(root.table("law", {"name": "tanh"}), laws)
-    if "models" not in values:  # nothing below can be read without
+    if "models" not in values:  # nothing below can be read without models
         with root.gathering():
             root.finish()
         root.raise_mistakes()
@@ -100,10 +101,10 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
     with root.gathering():
         values["communication"] = _graph(tables["communication"], len(models), validate_graph)
     with root.gathering():
-        hears = values.get("communication")
-        known = hears is not None and k is not REQUIRED  # else who reaches whom isn't
+        communication = values.get("communication")
+        known = communication is not None and k is not REQUIRED  # otherwise hop distances can't be checked
         values["task"] = _graph(
-            tables["task"], len(models), lambda graph, _: check_task_graph(graph, hears, k) if known else graph
+            tables["task"], len(models), lambda graph, _: check_task_graph(graph, communication, k) if known else graph
         )
     for name, table in (("delta", tables["delta"]), ("theta", theta)):
         with root.gathering():  # types without an input observer need no theta
@@ -125,12 +126,12 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
 
 
 def _sized(scenario: Scenario, auto: set[tuple[str, str | None]]) -> Scenario:
-    """With the initial values of those bounds, or of one type of agent, that the initial set needs."""
+    """The scenario with the bounds in `auto`, (name, agent type or None), sized from the initial set."""
     if not auto:
         return scenario
     try:
         sized = scenario.sized()
-    except DesignError:  # said by whoever builds or checks it, as for any other design
+    except DesignError:  # raised again when it is built or checked, as for any other design
         return scenario
     changes: dict[str, Any] = {}
     for name in {name for name, _ in auto}:
@@ -144,7 +145,7 @@ def _sized(scenario: Scenario, auto: set[tuple[str, str | None]]) -> Scenario:
 
 
 def _require_known_start(root: CheckedTable, fleet: Fleet, name: str, kind: str | None) -> None:
-    """Refuse to size theta(0) where nothing bounds what it has to start above."""
+    """Refuse to size theta(0) where g is unbounded."""
     for i, model in enumerate(fleet.models):
         if name == "theta" and kind in (None, model.type) and not model.input_map_bounded:
             root.note(
@@ -223,7 +224,8 @@ def _per_state(table: CheckedTable, key: str, value: Any, count: int, model: Age
         )
     if not np.all(np.isfinite(values)) or (key == "initial_radius" and np.any(values < 0.0)):
         table.refuse(
-            key, f"got {shown(value)}, expected finite numbers{', none negative' if key == 'initial_radius' else ''}"
+            key,
+            f"got {abbreviated(value)}, expected finite numbers{', none negative' if key == 'initial_radius' else ''}",
         )
     return np.broadcast_to(values, (count, model.n)).ravel()
 
@@ -238,7 +240,8 @@ def _graph(table: CheckedTable, agents: int, check: Callable[[nx.Graph, int], nx
     for i, edge in enumerate(edges):
         if not fits(edge, _Edge) or not all(0 <= agent < agents for agent in edge):
             table.note(
-                f"edges[{i}]", f"got {shown(edge)}, expected two numbers of agents, integers from 0 to {agents - 1}"
+                f"edges[{i}]",
+                f"got {abbreviated(edge)}, expected two numbers of agents, integers from 0 to {agents - 1}",
             )
         elif edge[0] == edge[1]:
             table.note(f"edges[{i}]", f"got {list(edge)}, but an agent can't be its own neighbour; remove it")

@@ -1,4 +1,4 @@
-"""Twelve agents of four kinds in one network, with every kind of disturbance."""
+"""Twelve agents of four types in one network, with every kind of disturbance."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ SIDE = 4.0  # m: positions start in a square of twice this side
 
 
 def mixed_fleet() -> Scenario:
-    """Three integrators, three carts, three unicycles and three vessels meet, over a ring in which no two alike touch.
+    """Three integrators, three carts, three unicycles and three vessels meet, over a ring without equal neighbours.
 
-    Two chords join alike agents all the same. Heterogeneous in n_i (2, 4, 3, 6) and m_i. Unicycles have no input
+    Two chords join agents of equal type. Heterogeneous in n_i (2, 4, 3, 6) and m_i. Unicycles have no input
     observer, since their g depends on the heading; their inputs are bounded, which is enough for the state observer
     (the paper's remark on omitting it). The vessels' drift is only locally Lipschitz: limited forces and drag keep
     their velocities bounded. Disturbances are a sinusoid on the integrators, band-limited noise on the carts'

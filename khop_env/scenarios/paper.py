@@ -12,7 +12,7 @@ TASK_EDGES = ((0, 1), (0, 2), (0, 3), (1, 4), (2, 4), (2, 7), (3, 5), (3, 6), (4
 
 
 def paper() -> Scenario:
-    """Eight drifting integrators agree along task edges of which most join agents that can't hear each other.
+    """Eight drifting integrators agree along task edges, most of them to k-hop targets.
 
     Published (T. Zaccherini, S. Liu and D. V. Dimarogonas, Robust Estimation and Control for Heterogeneous Multi-agent
     Systems Based on Decentralized k-hop Prescribed Performance Observers): N = 8, k = 3, n = 2, the drift f, the form
@@ -45,4 +45,5 @@ def paper() -> Scenario:
         disturbance=Sinusoid(0.3, frequency=(0.5, 2.0)),
         radius=1.5,
         law=LawChoice("tanh", {"gain": gain}),
+        figure_agent=3,  # agent 4 of the paper, which counts from 1
     )

@@ -17,18 +17,18 @@ RATE = 5.0  # 1/s, the paper's
 
 
 def random_geometric(agents: int = 100, k: int = 2, seed: int = 0, rate: float = RATE) -> Scenario:
-    """Single integrators on a random geometric graph, each to agree with its nearest neighbours out of earshot.
+    """Single integrators on a random geometric graph, each to agree with neighbours and with a k-hop target.
 
-    Agents are uniform points at unit density, hear each other within the range that makes the mean degree about 5, and
-    are connected by construction: the Euclidean minimum spanning tree is added. The task graph is a spanning tree of
-    communication edges, so that the team can agree, and for every agent an edge to one that it estimates but can't
-    hear. The bounds' initial values are sized from the initial set, so that every member of the family is feasible.
+    Agents are uniform points at unit density; their communication range makes the mean degree about 5, and they are
+    connected by construction: the Euclidean minimum spanning tree is added. The task graph is a spanning tree of
+    communication edges, so that the team can agree, and for every agent an edge to a random k-hop target. The bounds'
+    initial values are sized from the initial set, so that every member of the family is feasible.
 
     Args:
         agents: N, from 4 to 10 000 and more.
         k: agents up to k hops away are estimated, at least 2.
-        seed: of the positions, and of who is to agree with whom.
-        rate: at which the bounds on estimates fall, in 1/s.
+        seed: of the positions and of the task graph.
+        rate: decay rate of the bounds on estimation errors, in 1/s.
 
     Raises:
         ValueError: for fewer than 4 agents or more than 100 000, k below 2, a negative or huge seed, or a rate that
@@ -51,9 +51,9 @@ def random_geometric(agents: int = 100, k: int = 2, seed: int = 0, rate: float =
     task = nx.Graph(nx.bfs_edges(communication, 0))
     task.add_nodes_from(range(agents))
     for i, reached in enumerate(hop_distances(communication, k)):
-        unheard = [j for j, hops in reached.items() if hops >= 2]
-        if unheard:
-            task.add_edge(i, int(rng.choice(unheard)))
+        targets = [j for j, hops in reached.items() if hops >= 2]
+        if targets:
+            task.add_edge(i, int(rng.choice(targets)))
     most_edges = max(degree for _, degree in task.degree)
     return Scenario(
         name=f"random_geometric:agents={agents},k={k},seed={seed}" + (f",rate={rate:g}" if rate != RATE else ""),

@@ -44,29 +44,30 @@ class LawChoice:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario:
-    """One problem, complete: what a simulator or an environment is built from.
+    """A complete problem, from which a simulator or an environment is built.
 
     Attributes:
-        name: what it is called.
+        name: of the scenario, also of its folder of results.
         description: one line.
         models: one agent model per agent; neighbours with equal models are evaluated together.
-        communication: who hears whom; nodes 0..N-1, connected.
-        task: who should agree with whom, on the same nodes, within k hops.
+        communication: the communication graph; nodes 0..N-1, connected.
+        task: the task graph: pairs of agents that should agree, on the same nodes, within k hops.
         k: agents up to k hops away are estimated.
         relay: whether agents relay their neighbours' states (the paper's Assumption 4).
         delta: bounds on the state estimation errors.
         theta: bounds on the input estimation errors, where there are input observers.
-        observers: per agent, which simplification its observers use; None for the default of `ObserverDesign`.
+        observers: per agent the options of its observers; None for the default of `ObserverDesign`.
         disturbance: w_i(x, t), or None.
         center: (n,) centre of the box that states start in, and the observers' first guess.
         radius: (n,) its half widths.
-        law: the feedback law it is meant to run with.
+        law: name and parameters of the default feedback law.
         duration: length of an experiment in s.
         dt: step in s.
         order: of the proximal step.
+        figure_agent: index of the agent whose estimates figures show; None for the agent with most observers.
 
     Raises:
-        ValueError: if graphs, sets and agents don't fit together; the message says which.
+        ValueError: if graphs, sets and agents don't match; the message names them.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Scenario:
     duration: float = 10.0
     dt: float = 0.01
     order: int = 2
+    figure_agent: int | None = None
 
     def __post_init__(self) -> None:
         self._check_values()
@@ -105,13 +107,13 @@ class Scenario:
             raise ValueError(f"scenario {self.name!r}: radius must not be negative")
 
     def _check_values(self) -> None:
-        """What can be seen without fleet and graphs."""
+        """Check the values that don't depend on fleet and graphs."""
         for key, text in (("name", self.name), ("description", self.description.replace("\n", ""))):
             if not text.isprintable():
                 raise ValueError(f"scenario {self.name!r}: {key} must not have control characters; got {text!r}")
         if not 0 < len(self.name) <= 200 or "/" in self.name:
             raise ValueError(
-                f"a scenario's name names a folder, too: 1 to 200 characters without '/'; got {self.name[:200]!r}"
+                f"a scenario's name is also a folder's: 1 to 200 characters without '/'; got {self.name[:200]!r}"
             )
         for what, values in (
             ("relay", [self.relay]),
@@ -127,10 +129,23 @@ class Scenario:
             raise ValueError(
                 f"scenario {self.name!r}: expected 1 to {MOST_AGENTS} models, one per agent; got {len(self.models)}"
             )
+        agent = self.figure_agent
+        if agent is not None and (type(agent) is not int or not 0 <= agent < len(self.models)):
+            raise ValueError(
+                f"scenario {self.name!r}: figure_agent must be None or an agent's index from 0 to "
+                f"{len(self.models) - 1}; got {agent!r}"
+            )
         try:
             number_of_steps(self.duration, self.dt)
         except ValueError as error:
             raise ValueError(f"scenario {self.name!r}: {error}") from None
+
+    def __repr__(self) -> str:
+        edges = f"{self.communication.number_of_edges()} communication and {self.task.number_of_edges()} task edges"
+        return (
+            f"Scenario({self.name!r}: {self.fleet}; k={self.k}, {edges}; law {self.law.name!r}, {self.duration:g} s in "
+            f"steps of {self.dt:g} s)"
+        )
 
     def replace(self, **changes: Any) -> Scenario:
         """A copy with some attributes changed."""
@@ -148,14 +163,14 @@ class Scenario:
 
     @cached_property
     def longest_step(self) -> tuple[float, int]:
-        """Longest step in s that no agent's drift asks to divide (inf if any will do), and whose drift it is."""
+        """Longest step in s for which all drifts are stable (inf if every step is), and the agent that limits it."""
         reach = np.abs(self.initial.center) + self.initial.radius
         bound = np.zeros(self.fleet.n) if self.disturbance is None else self.disturbance.attach(self.fleet).bound
         return self.fleet.explicit_step(reach, bound)
 
     @property
     def warnings(self) -> list[str]:
-        """What is allowed, but seldom meant."""
+        """Warnings about choices that are valid, but rarely intended."""
         parts = [[self.fleet.ids[i] for i in sorted(part)] for part in nx.connected_components(self.task)]
         if len(parts) < 2:
             return []
@@ -170,7 +185,7 @@ class Scenario:
         """The observers: k-hop sets, matrices and funnels.
 
         Raises:
-            DesignError: if they can't be designed as asked, or a bound of the user's own isn't one.
+            DesignError: if they can't be designed with these values, or a user's function isn't a performance function.
         """
         design = ObserverDesign(
             self.fleet,
@@ -182,15 +197,15 @@ class Scenario:
             self.observers,
         )
         for name, funnels in (("delta", design.states), ("theta", design.inputs)):
-            for bound in {id(one): one for one in funnels.bounds if not isinstance(one, Exponential)}.values():
+            for bound in {id(f): f for f in funnels.bounds if not isinstance(f, Exponential)}.values():
                 _check_bound(bound, name)
         return design
 
     def sized(self, margin: float = 1.25) -> Scenario:
         """A copy whose bounds start `margin` times as wide as the initial set needs; final values and rates stay.
 
-        Bounds given for all agents stay one function, bounds given by type get one per component. Where |g| is
-        unbounded, theta starts no lower than it is given here: `Simulator.reset` checks it.
+        One bound for all agents stays one function, bounds by type get one function per component. Where |g| is
+        unbounded, theta(0) isn't changed: `Simulator.reset` checks it.
 
         Args:
             margin: above 1.
@@ -210,16 +225,16 @@ class Scenario:
             if bounds is None:
                 continue
             needed = margin * funnels.smallest_initial_bound(radius)
-            given = funnels.delta.evaluate(np.zeros(1), np.empty((len(needed), 1)))[:, 0]
-            needed = np.where(np.isfinite(needed), needed, given)  # nothing is known of an unbounded g
+            present = funnels.delta.evaluate(np.zeros(1), np.empty((len(needed), 1)))[:, 0]
+            needed = np.where(np.isfinite(needed), needed, present)  # an unbounded g needs an infinite theta(0)
             if not isinstance(bounds, Mapping):
                 resized[name] = _widened(bounds, needed.max(initial=0.0))
                 continue
             agent_type = np.array([self.models[i].type for i in funnels.layout.target])[funnels.layout.row_target]
             resized[name] = {
                 kind: [
-                    _widened(one, needed[agent_type == kind].reshape(-1, n)[:, c].max(initial=0.0))
-                    for c, one in enumerate(bound if isinstance(bound, Sequence) else [bound] * n)
+                    _widened(function, needed[agent_type == kind].reshape(-1, n)[:, c].max(initial=0.0))
+                    for c, function in enumerate(bound if isinstance(bound, Sequence) else [bound] * n)
                 ]
                 for kind, bound in bounds.items()
                 for n in [next(model.n for model in self.models if model.type == kind)]
@@ -240,13 +255,13 @@ class Scenario:
         """A simulator of `num_envs` environments.
 
         Args:
-            law: feedback law, e.g. `agents.make_law(scenario.law)`; None to give inputs to `Simulator.step`.
-            observe: what the law sees of agents out of earshot.
-            observers: how they are stepped; `Proximal` of the scenario's `order` by default.
+            law: feedback law, e.g. `agents.make_law(scenario.law)`; None to pass inputs to `Simulator.step`.
+            observe: source of the states of k-hop targets in the law's view, as in `Simulator`.
+            observers: realisation of the observers; `Proximal` of the scenario's `order` by default.
             num_envs: number of environments B.
 
         Raises:
-            ValueError: for so many that memory wouldn't hold their estimates.
+            ValueError: for more environments than `MOST_NUMBERS` states and estimates allow.
         """
         width = self.fleet.n + self.design.states.layout.size + self.design.inputs.layout.size
         if num_envs * width > MOST_NUMBERS:
@@ -298,10 +313,10 @@ _SAMPLED_TIMES = np.concatenate([np.linspace(0.0, 10.0, 1001), np.geomspace(10.0
 
 
 def _check_bound(bound: PerformanceFunction, name: str) -> None:
-    """Sample a function of the user's own: positive and finite, and not below the infimum that it declares.
+    """Sample a user's performance function: positive and finite, and not below the infimum that it declares.
 
     Raises:
-        DesignError: with the time and the value.
+        DesignError: if it isn't; the message has the time and the value.
     """
     values = np.broadcast_to(np.asarray(bound(_SAMPLED_TIMES), dtype=float), _SAMPLED_TIMES.shape)
     floor = float(bound.infimum())

@@ -5,13 +5,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
+from khop_env.brief import spread
 from khop_env.observers import (
     Certified,
     Extremes,
@@ -26,62 +26,12 @@ from khop_env.observers import (
 )
 from khop_env.observers.disagreement import disagreement
 from khop_env.physics import read_only
-from khop_env.simulation.plant import FleetPlant
+from khop_env.simulation.initial import InitialSet
+from khop_env.simulation.plant import FleetPlant, parts_of_step
 from khop_env.simulation.state import LinkState, SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
 
-_WARM_UP_STEP = 1e-9  # s: short enough for any observers, long enough to run all of their code
-
-MOST_PARTS = 10_000
-"""Steps of the integrator that one `Simulator.step` may be divided into."""
-
-
-@dataclass(frozen=True, eq=False)
-class InitialSet:
-    """Where states start: uniformly in a box. Its centre is the observers' common first guess.
-
-    Attributes:
-        center: (n,) in the states' units.
-        radius: (n,) half widths, not negative.
-
-    Raises:
-        ValueError: if they differ in shape, or a number isn't finite or a half width negative.
-    """
-
-    center: FloatArray
-    radius: FloatArray
-
-    def __post_init__(self) -> None:
-        center, radius = np.asarray(self.center, dtype=float), np.asarray(self.radius, dtype=float)
-        if center.ndim != 1 or center.shape != radius.shape or not np.isfinite([center, radius]).all():
-            raise ValueError(f"center and radius must be finite, (n,) each; got {self.center!r} and {self.radius!r}")
-        if (radius < 0.0).any():
-            raise ValueError(f"radius must not be negative; got {radius.min():g} for component {radius.argmin()}")
-        object.__setattr__(self, "center", center)
-        object.__setattr__(self, "radius", radius)
-
-    def draw(self, rng: np.random.Generator) -> FloatArray:
-        """One (n,) initial state."""
-        return self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
-
-
-def parts_of_step(dt: float, longest: float, agent: str) -> int:
-    """Into how many equal parts a step is divided, so that the plant's own drift can take each of them.
-
-    Args:
-        dt: step in s.
-        longest: what the drift takes (`Fleet.explicit_step`), in s.
-        agent: whose drift it is, for the error.
-
-    Raises:
-        ValueError: for more than `MOST_PARTS`.
-    """
-    if dt > MOST_PARTS * longest:
-        raise ValueError(
-            f"dt = {dt:g} s is too long: the drift of {agent!r} takes {longest:.3g} s at a time, and no step is "
-            f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
-        )
-    return max(1, math.ceil(dt / longest))
+_WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
 
 
 class Simulator:
@@ -94,13 +44,15 @@ class Simulator:
         law: feedback law evaluated at every stage (continuous-time closed loop); None to hold the inputs given to
             `step` (sampled control).
         task: task graph; needed with a law, and by environments.
-        observe: what the law sees of agents out of earshot: "estimate", "oracle" or "local".
-        observers: how they are stepped; `Proximal(order=2)` by default.
+        observe: source of the states of k-hop targets in the law's view: "estimate", "oracle" (true states) or "local"
+            (none).
+        observers: realisation of the observers; `Proximal(order=2)` by default.
         num_envs: number of environments B.
 
     Attributes:
-        state: everything that a step reads and writes, batch last.
+        state: all arrays that a step reads and writes, batch last.
         observers: this simulator's own copy.
+        running_extremes: the arrays that `extremes` copies; overwritten by steps.
 
     Raises:
         DesignError: if the initial set doesn't fit into the funnels.
@@ -127,7 +79,7 @@ class Simulator:
             raise ValueError(f"num_envs must be at least 1; got {num_envs!r}")
         self.design, self.fleet, self.initial, self.num_envs = design, design.fleet, initial, num_envs
         self.disturbance = disturbance
-        bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` sees where it starts
+        bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` checks its initial value
         design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         self.observers: Observers = copy.copy(observers or Proximal())  # its buffers are this simulator's own
         self.observers.prepare(design, num_envs)
@@ -145,7 +97,7 @@ class Simulator:
             links=LinkState.ideal(design.links, num_envs),
         )
         self._before = self.state.copy()
-        self._extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
+        self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach, pushed = np.abs(initial.center) + initial.radius, np.zeros(self.fleet.n)
         self._longest_step, self._stiffest = self.fleet.explicit_step(
             reach, pushed if attached is None else attached.bound
@@ -154,10 +106,15 @@ class Simulator:
 
     # -- reading -------------------------------------------------------------------------------------------------
 
+    def __repr__(self) -> str:
+        law = self.plant.law
+        name = "no law" if law is None else f"law {getattr(law, '__name__', None) or repr(law)}"
+        return f"Simulator({self.design}; {self.observers!r}, {name}, num_envs={self.num_envs}, {spread(self.state.t)})"
+
     @property
     def t(self) -> FloatArray:
         """(B,) time since reset in s."""
-        return read_only(self.state.t)
+        return read_only(self.state.t.view())
 
     @property
     def x(self) -> FloatArray:
@@ -187,10 +144,10 @@ class Simulator:
     @property
     def extremes(self) -> Extremes:
         """The largest ratios at any grid point since the last reset."""
-        return self._extremes.copied()
+        return self.running_extremes.copied()
 
     def error_bounds(self) -> Certified:
-        """The guaranteed bound on the error of every estimate now, (P, B), batch last, and what it rests on."""
+        """The guaranteed bound on the error of every estimate now, (P, B), batch last, and its basis."""
         return self.observers.bound(self.state, np.empty_like(self.state.memory["estimate"]))
 
     def errors(self) -> FloatArray:
@@ -228,13 +185,13 @@ class Simulator:
         Raises:
             ValueError: for x0 of a wrong shape or not finite, not R seeds, or `env_ids` that are out of range,
                 duplicated or not integers.
-            DesignError: for an x0 that the observers can't start from; nothing has been reset then.
+            DesignError: for an x0 outside the funnels; nothing has been reset then.
         """
         chosen = self.env_list(env_ids)
         seeds = [seed + int(b) for b in chosen] if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != len(chosen):
             raise ValueError(f"expected one seed or {len(chosen)}, one per environment; got {len(seeds)}")
-        generators = [np.random.default_rng(each) for each in seeds]  # raises for what can't be a seed
+        generators = [np.random.default_rng(each) for each in seeds]  # raises for an invalid seed
         start = self._initial_states(x0, len(chosen))
         state, disturbance = self.state, self.plant.disturbance
         for b, rng in zip(chosen, generators, strict=True):
@@ -243,12 +200,12 @@ class Simulator:
                 state.drawn[b] = disturbance.draw(rng)
         if start is not None:
             state.x[:, chosen] = np.broadcast_to(start, (len(chosen), self.fleet.n)).T
-        for zeros in (state.t, state.u, *self._extremes):
+        for zeros in (state.t, state.u, *self.running_extremes):
             zeros[..., chosen] = 0.0
         self.observers.reset(state.memory, chosen, generators, self.initial.center)
         self.plant.actuate(state)
-        self.observers.raise_extremes(state, self._extremes)
-        if not np.all(self._extremes.input_normalized[chosen] < 1.0):
+        self.observers.raise_extremes(state, self.running_extremes)
+        if not np.all(self.running_extremes.input_normalized[chosen] < 1.0):
             away = np.where(np.isfinite(self.g), np.abs(self.g), 0.0).max(axis=0)
             self.design.require_feasible_start(np.zeros(self.fleet.n), away)
         return self
@@ -257,13 +214,14 @@ class Simulator:
         """Advance every environment by `dt` seconds.
 
         Args:
-            dt: step in s, positive; done in equal parts where a drift can't take it (`AgentModel.explicit_step`).
+            dt: step in s, positive; divided into equal parts where it is too long for a drift
+                (`AgentModel.explicit_step`).
             u: (m,) or (B, m) inputs held over the step, where the simulator has no law; the last ones if left out.
                 They are not clipped: keep them within `input_limit` if the design assumes a bounded input map.
 
         Raises:
-            ValueError: for a step that isn't positive or would have too many parts, or inputs given to a simulator
-                with a law, misshapen or not finite; the state is unchanged.
+            ValueError: for a step that isn't positive or would have too many parts, or inputs that are passed to a
+                simulator with a law, of a wrong shape or not finite; the state is unchanged.
             FunnelError: if an explicit step leaves the funnel; the state is the last one inside.
             SolveError: if a right-hand side gives numbers that aren't finite; likewise.
         """
@@ -276,16 +234,16 @@ class Simulator:
         self.advance(float(dt), parts)
 
     def hold(self, u: FloatArray) -> None:
-        """Hold inputs (m, B) from now on; batch last, and not checked: for callers that have done so.
+        """Hold inputs from now on, without checks: for callers that have checked them.
 
         Args:
-            u: batch last, finite, in a simulator without a law.
+            u: (m, B) physical inputs, batch last and finite; the simulator has no law.
         """
         self.state.u[...] = u
         self.plant.actuate(self.state)
 
     def parts_of(self, dt: float) -> int:
-        """Into how many equal parts `step` divides a step, so that the plant's own drift can take each of them.
+        """Number of equal parts into which `step` divides a step, so that the plant's drift is stable in each of them.
 
         Raises:
             ValueError: for more than `MOST_PARTS`.
@@ -293,7 +251,7 @@ class Simulator:
         return parts_of_step(dt, self._longest_step, self.fleet.ids[self._stiffest])
 
     def advance(self, dt: float, parts: int) -> None:
-        """`step` with the inputs in force, and without checks: for callers that have done them.
+        """`step` with the inputs in force, without checks: for callers that have checked the step.
 
         Args:
             dt: step in s.
@@ -307,21 +265,21 @@ class Simulator:
                 if part:
                     state.copy_step(before)
                 self.observers.advance(self.plant, before, state, dt / parts)
-                self.observers.raise_extremes(state, self._extremes)
+                self.observers.raise_extremes(state, self.running_extremes)
         except BaseException:
             start.copy_step(state)
             raise
 
     def warm_up(self) -> None:
-        """Compile everything that a step runs; the state stays as it is."""
-        saved, seen = self.save(), self._extremes.copied()
+        """Compile all code that a step runs; the state is unchanged."""
+        saved, extremes = self.save(), self.running_extremes.copied()
         try:
             self.advance(_WARM_UP_STEP, 1)
         except (FunnelError, SolveError):
             pass  # the first real step will raise it again
         finally:
             self.restore(saved)
-            self._extremes = seen
+            self.running_extremes = extremes
 
     def save(self) -> SimulatorState:
         """Everything needed to continue bit for bit."""
@@ -335,11 +293,11 @@ class Simulator:
         """
         self.state.assign(saved)
         self.restart_extremes()
-        self.observers.raise_extremes(self.state, self._extremes)
+        self.observers.raise_extremes(self.state, self.running_extremes)
 
     def restart_extremes(self) -> None:
-        """Forget the ratios seen so far: `extremes` are those of the steps to come."""
-        for running in self._extremes:
+        """Reset the running maxima: `extremes` are then those of the steps to come."""
+        for running in self.running_extremes:
             running[...] = 0.0
 
     def env_list(self, env_ids: Sequence[int] | IntArray | None) -> IntArray:
@@ -352,14 +310,14 @@ class Simulator:
             return np.arange(self.num_envs)
         chosen = np.asarray(env_ids)
         if chosen.dtype == bool:
-            raise ValueError("env_ids must be numbers, not a mask: give np.flatnonzero(mask)")
+            raise ValueError("env_ids must be indices, not a mask: give np.flatnonzero(mask)")
         wrong = chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu")
         if wrong or np.any((chosen < 0) | (chosen >= self.num_envs)) or len(np.unique(chosen)) < len(chosen):
-            raise ValueError(f"env_ids must be different ones among 0 to {self.num_envs - 1}; got {env_ids!r}")
+            raise ValueError(f"env_ids must be different indices from 0 to {self.num_envs - 1}; got {env_ids!r}")
         return chosen.astype(np.int64)
 
     def _initial_states(self, x0: ArrayLike | None, count: int) -> FloatArray | None:
-        """Check given initial states, before anything is overwritten."""
+        """Check initial states, before anything is overwritten."""
         if x0 is None:
             return None
         states = np.asarray(x0, dtype=float)
@@ -372,7 +330,7 @@ class Simulator:
         return states
 
     def _checked_inputs(self, u: ArrayLike) -> FloatArray:
-        """Inputs given to `step`, or an error that names what is wrong with them."""
+        """Inputs of `step`, checked."""
         if self.plant.law is not None:
             raise ValueError("this simulator has a law, which computes the inputs; build it with law=None to give u")
         inputs = np.asarray(u, dtype=float)

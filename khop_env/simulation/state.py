@@ -1,4 +1,4 @@
-"""A simulator's whole state: what has to be saved so that a run continues bit for bit."""
+"""The complete state of a simulator, from which a run continues bit for bit."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.observers import FloatArray, Memory
 from khop_env.physics import Links
 
 
 @dataclass(frozen=True, eq=False)
 class LinkState:
-    """Which links are up, and how old is what came over them, in B environments.
+    """State of the communication links in B environments: up or down, and the age of the newest message.
 
     Attributes:
         weight: (L, B) 1 while a link is up, 0 while it is down, in the order of `ObserverDesign.links`.
@@ -22,16 +23,18 @@ class LinkState:
     weight: FloatArray
     age: FloatArray
 
+    __repr__ = brief
+
     @staticmethod
     def ideal(links: Links, num_envs: int) -> LinkState:
-        """All links up, and everything delivered at once: read-only views of one number each, which cost nothing."""
+        """All links up, and all messages delivered at once: read-only views of one number each."""
         shape = len(links), num_envs
         return LinkState(np.broadcast_to(1.0, shape), np.broadcast_to(0.0, shape))
 
 
 @dataclass(slots=True)
 class SimulatorState:
-    """Arrays of B environments, batch last; everything that a step reads and writes.
+    """Arrays of B environments, batch last: all that a step reads and writes.
 
     Attributes:
         t: (B,) time since reset in s.
@@ -40,7 +43,7 @@ class SimulatorState:
         g: (n, B) their effect g_i(x_i, u_i).
         drawn: (B, K) the disturbance's random numbers of this episode.
         memory: of the observers, by name.
-        links: which links are up.
+        links: state of the communication links.
     """
 
     t: FloatArray
@@ -50,6 +53,8 @@ class SimulatorState:
     drawn: FloatArray
     memory: Memory
     links: LinkState
+
+    __repr__ = brief
 
     def arrays(self) -> dict[str, FloatArray]:
         """Every array that changes, by name; the observers' memory included."""
@@ -62,7 +67,7 @@ class SimulatorState:
         return SimulatorState(t, x, u, g, drawn, memory, self.links)
 
     def copy_step(self, other: SimulatorState) -> None:
-        """Write what a step changes into `other`, of the same shapes: all but the episode's draws."""
+        """Copy the arrays that a step changes into `other`, of the same shapes: all but the episode's draws."""
         for ours, theirs in ((self.t, other.t), (self.x, other.x), (self.u, other.u), (self.g, other.g)):
             np.copyto(theirs, ours)
         for name, ours in self.memory.items():

@@ -1,4 +1,4 @@
-"""What a feedback law gets to see: the states it may know, read through the task graph's edges."""
+"""The view of a feedback law: the states that each agent knows, along the edges of the task graph."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 import networkx as nx
 import numpy as np
 
+from khop_env.brief import brief
 from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
 from khop_env.physics import Fleet, read_only
@@ -18,18 +19,18 @@ OBSERVE: tuple[Observe, ...] = ("estimate", "oracle", "local")
 
 @dataclass(slots=True)
 class View:
-    """What the agents know at one instant, in a form that a law can use for all of them at once.
+    """The knowledge of all agents at one instant, batched for a law.
 
     Attributes:
         fleet: the agents' models and offsets.
         x: (B, n) states; agent i's law may read its own slice only.
-        edges: (E, 2) directed task edges: agent i = edges[:, 0] is to act on agent j = edges[:, 1], which is -1 where
-            j isn't one of the fleet's.
-        known: (B, E) whether i knows anything of j's state: it receives from j, or estimates it.
-        displacement: (B, E, d) position of j, as i hears or estimates it, minus i's own and minus what the task wants
-            it to be, in m; 0 where not known.
+        edges: (E, 2) directed task edges: agent i = edges[:, 0] acts on agent j = edges[:, 1], which is -1 where j
+            isn't in the fleet.
+        known: (B, E) whether i knows j's state: j is its neighbour, or it estimates j.
+        displacement: (B, E, d) position of j, received or estimated by i, minus i's own position and minus the
+            displacement that the task asks for, in m; 0 where not known.
 
-    The arrays are read-only, and overwritten by the next evaluation; a law that keeps one copies it.
+    The arrays are read-only, and overwritten by the next evaluation; copy those that you keep.
     """
 
     fleet: Fleet
@@ -38,15 +39,17 @@ class View:
     known: np.ndarray
     displacement: FloatArray
 
+    __repr__ = brief
+
     def known_edges(self) -> IntArray:
-        """(N, B) of how many of its task edges each agent knows the other end."""
+        """(N, B) number of each agent's task edges whose other agent it knows."""
         counts = np.zeros((len(self.fleet), len(self.known)), np.int64)
         np.add.at(counts, self.edges[:, 0], self.known.T)
         return counts
 
 
 class Law(Protocol):
-    """A feedback law: a pure function of time and of what the agents know."""
+    """A feedback law: a pure function of time and of the agents' knowledge."""
 
     def __call__(self, t: FloatArray, view: View) -> FloatArray:
         """Inputs (B, m) of the whole fleet at the times `t` (B,), within the input limits."""
@@ -57,9 +60,9 @@ class ViewBuilder:
     """Fills a `View` from the simulator's states and estimates.
 
     Args:
-        design: the observers, which say who estimates whom.
+        design: the observers.
         task: the task graph on the same nodes.
-        observe: what stands for agents out of earshot: their "estimate", the truth ("oracle"), or nothing ("local").
+        observe: source of the states of k-hop targets: their "estimate", the true states ("oracle"), or none ("local").
         num_envs: number of environments.
     """
 
@@ -82,38 +85,41 @@ class ViewBuilder:
         self.view = View(
             fleet=fleet,
             x=np.zeros((num_envs, fleet.n)),
-            edges=edges,
+            edges=read_only(edges[:]),
             known=np.broadcast_to(self._kind < 2, (num_envs, len(edges))),
-            displacement=self._columns.transpose(2, 0, 1),
+            displacement=read_only(self._columns.transpose(2, 0, 1)),
         )
 
     @property
     def sources(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Per edge where the compiled loop reads: what kind of value (E,), own and other's position columns (E, d)."""
+        """Per edge the sources of the compiled loop: kind of value (E,), rows of own and of other position (E, d)."""
         return self._kind, self._own, self._other
 
     def update(self, x: FloatArray, estimate: FloatArray) -> View:
         """The view at states `x` (n, B) and estimates (P, B)."""
         displacements(self._kind, self._own, self._other, x, estimate, self._columns)
-        # both anew: in a copy of this object they would be views of other arrays
-        self.view.x = read_only(x.T)
-        self.view.displacement = read_only(self._columns.transpose(2, 0, 1))
-        return self.view
+        view = self.view
+        # made once, and again in a copy of this object, whose views would be of the original's arrays
+        if view.x.base is not x:
+            view.x = read_only(x.T)
+        if view.displacement.base is not self._columns:
+            view.displacement = read_only(self._columns.transpose(2, 0, 1))
+        return view
 
 
 @compiled
 def displacements(
     kind: IntArray, own: IntArray, other: IntArray, x: FloatArray, estimate: FloatArray, out: FloatArray
 ) -> None:
-    """Write (E, d, B) displacements along task edges: kind 0 reads the state, 1 an estimate, 2 leaves what is there."""
+    """Write (E, d, B) displacements along task edges: kind 0 reads the state, 1 an estimate, 2 writes nothing."""
     for edge in range(kind.size):
         if kind[edge] == 2:
             continue
         for c in range(own.shape[1]):
-            mine, theirs = own[edge, c], other[edge, c]
+            own_row, other_row = own[edge, c], other[edge, c]
             if kind[edge] == 1:
                 for env in range(x.shape[1]):
-                    out[edge, c, env] = estimate[theirs, env] - x[mine, env]
+                    out[edge, c, env] = estimate[other_row, env] - x[own_row, env]
             else:
                 for env in range(x.shape[1]):
-                    out[edge, c, env] = x[theirs, env] - x[mine, env]
+                    out[edge, c, env] = x[other_row, env] - x[own_row, env]

@@ -1,4 +1,4 @@
-"""Tasks: one file each, on any scenario. `Task` is what a task of your own derives from."""
+"""Tasks: one file each, on any scenario. A task of your own derives from `Task`."""
 
 from khop_env.tasks.base import Column, MapCanvas, Outcome, Task, World, directed
 from khop_env.tasks.consensus import Consensus

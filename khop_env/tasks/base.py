@@ -1,6 +1,6 @@
-"""Base class of tasks: who acts, what is good, when it is over, and what an observation shows beside states.
+"""Base class of tasks: acting agents, rewards, termination, infos, and additional columns of observations.
 
-A task is one file. It is bound to a fleet once, and then asked at every control period; an environment
+A task is one file. It is bound to a fleet once, and evaluated after every control period; an environment
 (`khop_env.env`) does the rest: observations, actions, seeds, rendering, saving and restoring.
 """
 
@@ -16,19 +16,20 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.brief import brief
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
 from khop_env.physics import Fleet
 
 Signature = dict[str, tuple[str, ...]]
-"""Properties in words, by a plural noun: what two environments must have in common to exchange states."""
+"""Properties in words, by a plural noun, which two environments must have in common to exchange states."""
 
 
 @dataclass(eq=False)
 class World:
-    """The true state of B environments, as tasks see it: arrays with the batch as their last axis.
+    """The true state of B environments for tasks: arrays with the batch as their last axis.
 
     Attributes:
-        design: the observers, which know the fleet and the communication graph.
+        design: the observers, with the fleet and the communication graph.
         graph: the scenario's task graph on the agents' indices.
         num_envs: number of environments B.
         control_period: time between actions in s.
@@ -47,6 +48,8 @@ class World:
     x: FloatArray
     inputs: FloatArray
 
+    __repr__ = brief
+
     @property
     def fleet(self) -> Fleet:
         """All agents."""
@@ -63,7 +66,7 @@ class Outcome(NamedTuple):
     Attributes:
         reward: (B, N) of each acting agent.
         terminated: (B,) whether the episode has ended, for the whole team.
-        infos: (B, N) each, by name; "task_error" has to be among them: how far an agent is from what it should reach.
+        infos: (B, N) each, by name; must have "task_error", the distance of an agent from its goal in the task's unit.
     """
 
     reward: FloatArray
@@ -109,16 +112,16 @@ class MapCanvas(Protocol):
 
 
 class Task(abc.ABC):
-    """What a team is to do. A subclass implements `evaluate`; everything else has a default.
+    """A task for a team. A subclass implements `evaluate`; everything else has a default.
 
     Attributes:
         name: of the environment without its version; by default the class's name in snake case.
         version: of the environment.
-        default_scenario: name of the scenario that it is played on unless another one is asked for.
-        driven_label: what an agent that doesn't act is called.
-        edges: (E, 2) directed pairs (i, j), sorted: agent j matters to agent i's task. Set by `bind`. Slots of
-            observations begin with these agents, laws act along these edges, and frames show them.
-        memory: arrays that the next steps depend on, e.g. what `reset` has drawn; saved and restored with the state.
+        default_scenario: name of the scenario that is used if none is specified.
+        driven_label: name in messages and legends of an agent that doesn't act.
+        edges: (E, 2) directed pairs (i, j), sorted: agent i's task depends on agent j. Set by `bind`. Slots of
+            observations begin with these agents, laws act along these edges, and frames draw them.
+        memory: arrays that the next steps depend on, e.g. numbers drawn by `reset`; saved and restored with the state.
     """
 
     name: ClassVar[str] = ""
@@ -139,10 +142,10 @@ class Task(abc.ABC):
         return f"{self.name}_v{self.version}"
 
     def bind(self, world: World) -> None:
-        """Get ready for a fleet: index arrays, `edges`, zeroed `memory`. Called once, before everything else.
+        """Bind to a fleet: index arrays, `edges`, zeroed `memory`. Called once, before everything else.
 
         Args:
-            world: whose arrays aren't meaningful yet.
+            world: of the environment; its arrays hold no values yet.
 
         Raises:
             ValueError: if the task can't be done by this fleet.
@@ -168,7 +171,7 @@ class Task(abc.ABC):
         Args:
             world: for names, models and limits.
             agent: index of the observing agent.
-            other: index of the agent that the slot is about; all slots need as many columns.
+            other: index of the agent in the slot; all slots need as many columns.
         """
         return ()
 
@@ -176,12 +179,12 @@ class Task(abc.ABC):
         """Write the values of live columns.
 
         Args:
-            world: now.
+            world: at the time of the observation.
             out: (rows, B) to be overwritten.
         """
 
     def reset(self, world: World, env_ids: IntArray, rngs: Sequence[np.random.Generator]) -> None:  # noqa: B027
-        """Draw what an episode needs; does nothing by default.
+        """Draw the random numbers of an episode; does nothing by default.
 
         Args:
             world: at the beginning of the new episodes; initial states are drawn before, from the same generators.
@@ -193,16 +196,16 @@ class Task(abc.ABC):
         """Write the inputs of agents that don't act; called before every step of the simulator.
 
         Args:
-            world: now.
+            world: at the beginning of the step.
             u: (m, B) physical inputs, to be overwritten in the rows of these agents.
         """
 
     @abc.abstractmethod
     def evaluate(self, world: World) -> Outcome:
-        """Rewards, whether it is over, and infos.
+        """Rewards, termination and infos.
 
-        It is called after resets, too, of some environments or all, and whenever the task error is asked for: a second
-        call at the same instant has to give the same and to change nothing.
+        It is also called after resets, of some environments or all, and whenever the task error is read: a second call
+        at the same instant must return the same values and change nothing.
 
         Args:
             world: at the end of a control period.
@@ -223,7 +226,7 @@ class Task(abc.ABC):
         return reward
 
     def signature(self, world: World) -> Signature:
-        """What two tasks must have in common for one to continue from the other's state, in words."""
+        """Properties, in words, that two tasks must have in common to continue from each other's state."""
         ids = world.fleet.ids
         return {
             "tasks": (self.name,),

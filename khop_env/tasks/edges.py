@@ -1,4 +1,4 @@
-"""Tasks along edges: agent i wants p_j - p_i = d_ij for each of its edges (i, j)."""
+"""Tasks along edges: agent i is to reach p_j - p_i = d_ij for each of its edges (i, j)."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class EdgeArguments(TypedDict, total=False):
 
 
 class EdgeArrays(NamedTuple):
-    """The edges of acting agents, and whose input is whose, as the compiled loop takes them.
+    """The edges of acting agents, and the owner of each input, for the compiled loop.
 
     Attributes:
         agent: (E,) number of the acting agent that an edge belongs to.
         own: (E, d) its position in the states.
-        other: (E, d) the other's.
-        displacement: (E, d) what p_other - p_own should be, in m.
+        other: (E, d) the other agent's position in the states.
+        displacement: (E, d) desired p_other - p_own, in m.
         weight: (E,) one over the number of the agent's edges.
-        input_owner: (m,) number of the acting agent whose input it is; -1 for agents that don't act.
+        input_owner: (m,) number of the acting agent that each input belongs to; -1 for agents that don't act.
     """
 
     agent: IntArray
@@ -48,7 +48,7 @@ class EdgeArrays(NamedTuple):
 
 @dataclass(eq=False, kw_only=True)
 class EdgeTask(Task):
-    """Agents keep displacements along directed task edges; a subclass says which, in `relations`.
+    """Agents keep displacements along directed task edges, which a subclass defines in `relations`.
 
     Every control period agent i gets -control_period (mean over its edges of |p_j - p_i - d_ij|^2 + effort |u_i|^2),
     with true positions at the end of the period and inputs u_i as fractions of their limits.
@@ -60,7 +60,7 @@ class EdgeTask(Task):
         displacement: (E, d) d_ij of `edges` in m. Set by `bind`.
 
     Raises:
-        ValueError: naming the argument, the value, and what is expected.
+        ValueError: for an argument out of range; the message names it, its value and the valid range.
     """
 
     reward: Reward = "agent"
@@ -80,7 +80,7 @@ class EdgeTask(Task):
         """The directed task edges (E, 2), sorted, and the displacement (E, d) to keep along each, in m."""
 
     def bind(self, world: World) -> None:
-        """Find the edges, and where the compiled loop reads."""
+        """Find the edges, and index arrays for the compiled loop."""
         super().bind(world)
         self.edges, self.displacement = self.relations(world)
         fleet, members = world.fleet, list(self.acting(world))
@@ -104,15 +104,15 @@ class EdgeTask(Task):
         self._efforts = np.zeros((len(members), world.num_envs))
 
     def slot_columns(self, world: World, agent: int, other: int) -> Sequence[Column]:
-        """The displacement wanted along the edge; zeros without one."""
+        """The desired displacement along the edge; zeros without an edge."""
         reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
-        wanted = self._wanted(agent, other)
+        desired = self._desired(agent, other)
         names = axis_names(world.fleet.position_dim)
         model = world.fleet.models[other]
         units = [model.states[name] for name in model.position]
         return [
             Column(f"displacement.{axis}", unit, -reach, reach, d)
-            for axis, unit, d in zip(names, units, wanted, strict=True)
+            for axis, unit, d in zip(names, units, desired, strict=True)
         ]
 
     def evaluate(self, world: World) -> Outcome:
@@ -139,7 +139,7 @@ class EdgeTask(Task):
         edges = [f"{ids[i]} to {ids[j]} by {d} m" for (i, j), d in zip(self.edges.tolist(), places, strict=True)]
         return {**super().signature(world), "task edges": tuple(edges)}
 
-    def _wanted(self, agent: int, other: int) -> list[float]:
+    def _desired(self, agent: int, other: int) -> list[float]:
         found = np.flatnonzero((self.edges[:, 0] == agent) & (self.edges[:, 1] == other))
         return self.displacement[found[0]].tolist() if found.size else [0.0] * self.displacement.shape[1]
 

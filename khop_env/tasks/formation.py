@@ -1,12 +1,12 @@
-"""Keep a formation: p_j - p_i = r_j - r_i along the edges of the task graph, wherever it stands."""
+"""Keep a formation anywhere: p_j - p_i = r_j - r_i along the edges of the task graph."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from khop_env.observers import FloatArray, IntArray
 from khop_env.tasks.base import World, directed
@@ -27,7 +27,7 @@ class Formation(EdgeTask):
         ValueError: for points of a wrong shape or not finite, or a spacing that isn't positive.
     """
 
-    points: ArrayLike | None = None
+    points: Sequence[Sequence[float]] | np.ndarray | None = None
     spacing: float = 1.0
 
     def relations(self, world: World) -> tuple[IntArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""Follow leaders that are out of range: they move along smooth random routes, which no other agent knows."""
+"""Follow leaders that are out of communication range and move along smooth random routes."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from khop_env.tasks.base import Signature, World
 from khop_env.tasks.edges import EdgeTask, require_positive, ring
 
 SINES = 3  # per axis
-BAND = (1.5, 2.5)  # rad/s: where the routes' frequencies are drawn from
+BAND = (1.5, 2.5)  # rad/s: range of the routes' frequencies
 POSITION_GAIN = 1.0  # 1/s: pulls a leader back to its route, so that drift and disturbance don't carry it away
 
 
 @dataclass(eq=False, kw_only=True)
 class LeaderFollowing(EdgeTask):
-    """Each follower keeps its place around a leader that it can't hear, if there is one within k hops.
+    """Each follower keeps its place around a leader that isn't its neighbour, if there is one within k hops.
 
-    Leaders take no part in the environment. Along each axis a leader's route has a velocity that is a sum of `SINES`
-    sines with frequencies drawn from `BAND` and random phases; the leader is commanded that velocity plus
-    `POSITION_GAIN` times its distance to the route.
+    Leaders take no part in the environment, and no other agent knows their routes. Along each axis the velocity of a
+    leader's route is a sum of `SINES` sines with frequencies drawn from `BAND` and random phases; the commanded
+    velocity is this plus `POSITION_GAIN` times the leader's distance to the route.
 
     Attributes:
-        leaders: their ids, or how many; by default as many of the fastest as it takes for every follower to have one
-            at 2 hops or more, and at least two.
+        leaders: their ids, or their number; by default the fastest agents, at least two and as many as are needed for
+            every follower to have a leader at 2 to k hops.
         follow: the leader of each follower by id; by default the nearest at 2 hops or more.
         leader_speed: root mean square speed in m/s; by default half of a leader's limit where its input is a velocity
             in m/s, and 0.5 m/s otherwise.
         spacing: radius of the ring around a leader on which its followers have their places, in m; 0 to meet it.
 
     Raises:
-        ValueError: for unknown agents, no follower, or a leader that its follower neither hears nor estimates.
+        ValueError: for unknown agents, no follower, or a leader more than k hops away from its follower.
     """
 
     default_scenario: ClassVar[str] = "convoy"
@@ -109,7 +109,7 @@ class LeaderFollowing(EdgeTask):
             inputs[:, fleet.input_slice(i)] = velocity_to_input(fleet.models[i], own, velocity[:, number])
 
     def signature(self, world: World) -> Signature:
-        """Leaders with their speeds, and everything that edges say."""
+        """Leaders with their speeds, edges and displacements."""
         ids = world.fleet.ids
         leaders = [f"{ids[i]} at {speed} m/s" for i, speed in zip(self.leader_indices, self.speeds, strict=True)]
         found = super().signature(world)
@@ -117,7 +117,7 @@ class LeaderFollowing(EdgeTask):
 
 
 def _speed(model: AgentModel) -> float:
-    """What a leader of this model can follow smoothly, in m/s rms."""
+    """Default speed of a leader of this model, in m/s rms: half of its smallest velocity limit, or 0.5."""
     limits = [limit for limit, unit in zip(model.input_limit, model.inputs.values(), strict=True) if unit == "m/s"]
     return 0.5 * min(limits) if limits and math.isfinite(min(limits)) else 0.5
 
@@ -128,7 +128,7 @@ def _choose_leaders(
     if leaders is not None and not isinstance(leaders, int | np.integer):
         if isinstance(leaders, str):
             leaders = [leaders]
-        return sorted({fleet.agent(one) for one in leaders})
+        return sorted({fleet.agent(leader) for leader in leaders})
     most = len(fleet) - 1
     if leaders is not None and not 1 <= leaders <= most:
         raise ValueError(f"leaders must be 1 to {most} of {len(fleet)} agents, or a list of ids; got {leaders!r}")
@@ -139,7 +139,7 @@ def _choose_leaders(
     while len(chosen) < (most if leaders is None else leaders):
         if leaders is None and len(chosen) >= min(2, most) and not any(waiting & far[i] for i in rest):
             break
-        # the fastest first, and of these the one that most followers still wait for
+        # the fastest first, and of these the agent at 2 to k hops from most followers without a leader
         best = max(rest, key=lambda i: (_speed(fleet.models[i]), len(waiting & far[i]), -i))
         chosen.append(best)
         rest.remove(best)
@@ -170,7 +170,7 @@ def _assign_followers(
             raise ValueError(
                 f"no leader within k hops of {name!r}; name more leaders (now {', '.join(names)}) or take a larger k"
             )
-        else:  # out of earshot if there is one, then the nearest, then the one with fewer followers
+        else:  # not a neighbour if possible, then the nearest, then the leader with fewer followers
             j = min(known, key=lambda j: (known[j] < 2, known[j], load[j], j))
         load[j] += 1
         pairs.append((i, j))

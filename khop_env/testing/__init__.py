@@ -1,4 +1,4 @@
-"""The contract of the environments as checks that run on anybody's: `check_environment(env)`, or `khop test`."""
+"""The contract of the environments as checks for any environment: `check_environment(env)`, or `khop test`."""
 
 from khop_env.testing.checking import CHECKS, check_environment
 from khop_env.testing.equality import arrays, difference

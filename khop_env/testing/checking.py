@@ -1,4 +1,4 @@
-"""All checks of an environment, one after the other."""
+"""Run all checks of an environment."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CHECKS: dict[str, Callable[[Subject], str | None]] = {
 }
 
 CHECKS = tuple(_CHECKS)
-"""The names of all checks, in the order in which they run."""
+"""Names of all checks, in the order in which they run."""
 
 
 def check_environment(
@@ -42,29 +42,29 @@ def check_environment(
     skip: Collection[str] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Report:
-    """Hold an environment against the contract of this library's own.
+    """Check that an environment fulfils the contract of this library's environments.
 
         check_environment(lambda: consensus_v0.parallel_env(my_scenario)).raise_if_failed()
 
     Args:
-        env: a PettingZoo ParallelEnv that was never reset, or better a function that makes a fresh one at each call. An
-            object is copied; what can't be copied skips the checks that need several.
-        steps: of an episode, and of comparisons.
-        seed: the first seed, of the environment and of actions.
-        skip: names of checks to leave out, of `CHECKS`: e.g. "other_seed" and "unseeded" where nothing is random.
-        progress: called with the fraction that is done.
+        env: a PettingZoo ParallelEnv that was never reset, or better a function that returns a new one at each call. An
+            object is copied; if it can't be copied, checks that need several environments are skipped.
+        steps: number of steps of episodes and comparisons.
+        seed: first seed of environments and actions.
+        skip: names from `CHECKS` to leave out, e.g. "other_seed" and "unseeded" if nothing is random.
+        progress: called with the completed fraction.
 
     Returns:
-        What passed, what failed and where, and what was skipped and why.
+        The result of each check: passed; failed and where; or skipped and why.
 
     Raises:
-        ValueError: for something that is no ParallelEnv, fewer than one step, a negative seed, or an unknown check.
+        ValueError: if `env` isn't a ParallelEnv, steps < 1, seed < 0, or a name in `skip` is unknown.
     """
     for name in skip:
         if name not in _CHECKS:
             raise ValueError(f"no check {name!r}; {did_you_mean(name, _CHECKS)}")
     if steps < 1 or seed < 0:
-        raise ValueError(f"steps must be at least 1 and seed not negative; got {steps} and {seed}")
+        raise ValueError(f"steps must be at least 1 and seed not negative; got steps={steps} and seed={seed}")
     subject = Subject(env, steps, seed)
     checks = []
     for number, (name, check) in enumerate(_CHECKS.items()):

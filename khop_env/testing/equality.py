@@ -1,4 +1,4 @@
-"""Equality bit for bit of what environments return, and the first place where it fails."""
+"""Bitwise comparison of nested values, with the first difference."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 
 def difference(first: Any, second: Any, place: str = "") -> str | None:
-    """The first difference between two nests of dicts, sequences, dataclasses, arrays and numbers.
+    """The first difference between two nested values of dicts, sequences, dataclasses, arrays and numbers.
 
     Args:
-        first: a nest.
-        second: another.
-        place: how the nest is called.
+        first: a nested value.
+        second: a nested value to compare with.
+        place: name of the value in the result.
 
     Returns:
         "observations['agent_0'][3]: 0.5, then 0.25", or None if they are equal bit for bit, types included.
@@ -47,7 +47,7 @@ def difference(first: Any, second: Any, place: str = "") -> str | None:
 
 
 def arrays(value: Any) -> Iterator[np.ndarray]:
-    """All arrays in a nest of dicts, sequences and object arrays."""
+    """All arrays in a nested value of dicts, sequences and object arrays."""
     if isinstance(value, np.ndarray):
         yield value
         if value.dtype == object:

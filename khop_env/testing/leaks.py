@@ -1,4 +1,4 @@
-"""No agent of this library's environments observes what it can't know."""
+"""Check that no agent's observation depends on information that it has no access to."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from khop_env.env import EnvState, KHopEnv
 from khop_env.testing.equality import difference
 from khop_env.testing.subject import Fault, Subject, called, play
 
-_VISIBLE = ("t", "x", "estimate")  # of the simulator's state: observations are read from these, and from nothing else
+_VISIBLE = ("t", "x", "estimate")  # the parts of the simulator's state that observations may depend on
 
 
 def leak(subject: Subject) -> None:
-    """No agent observes what it can't know."""
+    """Observations depend on accessible information only."""
     env = subject.own()
-    for number, seen in enumerate(play(env, 4, subject.seed, reset_seed=subject.seed)):
-        for agent, observation in seen["observations"].items():
+    for number, step in enumerate(play(env, 4, subject.seed, reset_seed=subject.seed)):
+        for agent, observation in step["observations"].items():
             if found := difference(observation, env.observe(agent), f"observations[{agent!r}]"):
-                raise Fault(f"{called(number, seen)} and observe() differ: {found}")
+                raise Fault(f"{called(number, step)} and observe() differ: {found}")
     fleet, design, mode = env.batched.fleet, env.batched.simulator.design, env.batched.settings.observe
     hops = dict(nx.all_pairs_shortest_path_length(design.communication))
     reach = design.k if mode == "oracle" else 1
@@ -46,14 +46,14 @@ def _array(name: str) -> Callable[[EnvState], Any]:
 
 
 def changed_by(env: KHopEnv, write: Callable[[EnvState], None]) -> dict[int, int]:
-    """Agents whose observation changes with the environment's state.
+    """Agents whose observation changes if the environment's state is edited.
 
     Args:
-        env: in mid-episode; its state stays as it is.
-        write: edits what `get_state` returned.
+        env: an environment in mid-episode; its state is restored.
+        write: edits the state returned by `get_state`.
 
     Returns:
-        The agents by their index in the fleet, each with the first column that changes.
+        The first changed column, by the agent's index in the fleet.
     """
     saved, fleet = env.get_state(), env.batched.fleet
     before = {agent: env.observe(agent) for agent in env.possible_agents}
@@ -71,19 +71,19 @@ def changed_by(env: KHopEnv, write: Callable[[EnvState], None]) -> dict[int, int
 
 
 def _require(env: KHopEnv, allowed: set[int], text: str, read: Callable[[EnvState], Any], parts: Iterable[Any]) -> None:
-    """Only the agents that are allowed to observe other numbers in parts of an array of the saved state."""
+    """Check that edits in parts of an array of the saved state change observations of allowed agents only."""
 
     def write(state: EnvState) -> None:
         for part in parts:
             array = read(state)[part]
-            array += 0.7 + 0.1 * np.arange(array.size).reshape(array.shape)  # far from the estimates of it
+            array += 0.7 + 0.1 * np.arange(array.size).reshape(array.shape)  # far from all estimates
 
     ids = env.batched.fleet.ids
     for i, column in changed_by(env, write).items():
         if i not in allowed:
             names = env.layout(ids[i]).names
             column_name = names[column] if column < len(names) else "beyond its layout"
-            known = ", ".join(ids[j] for j in sorted(allowed)) or "nobody"
+            known = ", ".join(ids[j] for j in sorted(allowed)) or "none"
             raise Fault(
-                f"{text} shows in the observation of {ids[i]!r}, entry {column} ({column_name}); allowed: {known}"
+                f"{text} changes the observation of {ids[i]!r}, entry {column} ({column_name}); allowed: {known}"
             )

@@ -1,4 +1,4 @@
-"""The checks that PettingZoo, Gymnasium and Stable-Baselines3 bring."""
+"""Environment checks of PettingZoo, Gymnasium and Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import numpy as np
 from pettingzoo.utils import parallel_to_aec
 
 from khop_env.env import JointEnv, KHopEnv
+from khop_env.extras import how_to_install
 from khop_env.testing.subject import Skip, Subject
 
-# What these checks warn of in environments of this library, on purpose: PettingZoo's own tests give `reset` an option
-# "options" that there isn't; observations may be ragged; padding is always zero.
+# Expected warnings in environments of this library: PettingZoo's tests pass an unknown option "options" to `reset`;
+# observations may be ragged; padding is always zero.
 _ON_PURPOSE = (
     r"reset\(\) ignores the option 'options'",
     "Agents have different observation space sizes|Observations are different shapes",
@@ -26,7 +27,7 @@ _ON_PURPOSE = (
 
 def pettingzoo(subject: Subject) -> str:
     """PettingZoo's parallel_api_test and api_test."""
-    with warnings.catch_warnings():  # the import makes example environments in a way that PettingZoo itself deprecates
+    with warnings.catch_warnings():  # on import PettingZoo uses its own deprecated functions
         warnings.simplefilter("ignore", DeprecationWarning)
         from pettingzoo.test import api_test, parallel_api_test
     with _collected(subject) as notes:
@@ -59,7 +60,7 @@ def sb3(subject: Subject) -> str:
     """SB3's check_env, with the team as one agent."""
     team = _team(subject)
     if importlib.util.find_spec("stable_baselines3") is None:
-        raise Skip("Stable-Baselines3 isn't installed: pip install 'khop_env[rl]'")
+        raise Skip(f"Stable-Baselines3 isn't installed: {how_to_install('rl')}")
     from stable_baselines3.common.env_checker import check_env
 
     with _collected(subject) as notes:
@@ -69,13 +70,13 @@ def sb3(subject: Subject) -> str:
 
 def _team(subject: Subject) -> JointEnv:
     if not isinstance(subject.env.unwrapped, KHopEnv):
-        raise Skip("a ParallelEnv is no gymnasium.Env; those of khop_env are checked as one agent")
+        raise Skip("a ParallelEnv isn't a gymnasium.Env; only those of khop_env can be checked as one agent")
     return JointEnv(subject.own())
 
 
 @contextlib.contextmanager
 def _collected(subject: Subject) -> Iterator[list[str]]:
-    """Collect warnings, each once, but for those that are meant so; and drop what is printed."""
+    """Collect unexpected warnings without duplicates, and discard printed output."""
     notes: list[str] = []
     expected = _ON_PURPOSE if isinstance(subject.env.unwrapped, KHopEnv) else ()
     with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stdout(io.StringIO()), np.errstate():

@@ -16,11 +16,11 @@ class Check:
     """The result of one check.
 
     Attributes:
-        name: of the check, one of `CHECKS`.
-        claim: what it checks, in a line.
+        name: name of the check, from `CHECKS`.
+        claim: the checked property, in one line.
         status: "passed", "failed" or "skipped".
-        detail: of a failed one what was got, where, and what was expected; of a skipped one the reason; of a passed one
-            what a library warned of or what couldn't be compared, mostly nothing.
+        detail: if failed, what was got, where, and what was expected; if skipped, the reason; if passed, warnings of
+            libraries or omitted comparisons, usually empty.
     """
 
     name: str
@@ -31,10 +31,10 @@ class Check:
 
 @dataclass(frozen=True)
 class Report:
-    """The results of all checks of an environment; as text a table of 80 columns.
+    """Results of all checks of an environment; `str` gives a table of 80 columns.
 
     Attributes:
-        environment: what was checked.
+        environment: name of the environment.
         checks: in the order in which they ran.
     """
 
@@ -51,7 +51,7 @@ class Report:
 
     def __str__(self) -> str:
         statuses = [check.status for check in self.checks]
-        counts = ", ".join(f"{statuses.count(one)} {one}" for one in ("passed", "failed", "skipped"))
+        counts = ", ".join(f"{statuses.count(status)} {status}" for status in ("passed", "failed", "skipped"))
         names = max((len(check.name) for check in self.checks), default=0)
         lines = textwrap.wrap(f"{self.environment}: {counts}", _WIDTH)
         for check in self.checks:
@@ -62,10 +62,10 @@ class Report:
         return "\n".join(lines)
 
     def raise_if_failed(self) -> None:
-        """For tests: a failed check is an error.
+        """Raise an error if a check failed; for tests.
 
         Raises:
-            AssertionError: naming what failed, and where.
+            AssertionError: if a check failed; the message lists the failed checks.
         """
         failed = tuple(check for check in self.checks if check.status == "failed")
         if failed:

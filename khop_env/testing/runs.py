@@ -1,4 +1,4 @@
-"""Checks of several runs against each other. Each raises Fault or Skip, or returns; reports print its docstring."""
+"""Checks that compare runs. A check raises Fault or Skip, or returns; reports print its docstring."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from khop_env.testing.subject import (
     record,
 )
 
-_SHORT = 20  # steps, where a few show it
+_SHORT = 20  # steps, if a few are enough
 
 
 def same_seed(subject: Subject) -> None:
-    """The same bits for the same seed, over episodes."""
+    """The same seed gives the same bits, over episodes."""
 
     def play_once() -> list[dict[str, Any]]:
         return record(subject.any(), subject.steps, subject.seed, reset_seed=subject.seed)
@@ -44,7 +44,7 @@ def same_seed(subject: Subject) -> None:
 
 
 def other_seed(subject: Subject) -> None:
-    """Other bits for another seed."""
+    """Different seeds give different episodes."""
     first, second = (
         record(subject.any(), _SHORT, subject.seed, reset_seed=seed) for seed in (subject.seed, subject.seed + 1)
     )
@@ -78,78 +78,78 @@ def global_random(subject: Subject) -> None:
     env = subject.any()
     with global_generators_seeded():
         before = np.random.get_state(), random.getstate()  # noqa: NPY002
-        for number, seen in enumerate(play(env, subject.steps, subject.seed, reset_seed=subject.seed)):
+        for number, step in enumerate(play(env, subject.steps, subject.seed, reset_seed=subject.seed)):
             now = np.random.get_state(), random.getstate()  # noqa: NPY002
             for text, first, second in zip(("NumPy", "Python"), before, now, strict=True):
                 if difference(first, second) is not None:
-                    raise Fault(f"{called(number, seen)} moves {text}'s global generator")
+                    raise Fault(f"{called(number, step)} moves {text}'s global generator")
 
 
 def memory(subject: Subject) -> None:
-    """Returned arrays belong to the caller, and stay so."""
+    """Returned arrays are never written or shared later."""
     env = subject.any()
     played = itertools.islice(play(env, _SHORT, subject.seed, reset_seed=subject.seed), 4)
-    kept = {called(number, seen): seen for number, seen in enumerate(played)}
+    kept = {called(number, step): step for number, step in enumerate(played)}
     if _has_state(env):
-        kept |= {f"state(), asked the {nth} time": {"state": env.state()} for nth in ("first", "second")}
+        kept |= {f"state(), {nth} call": {"state": env.state()} for nth in ("first", "second")}
     frozen = copy.deepcopy(kept)
     for _ in play(env, 3, subject.seed, begin=False):
         pass
     env.reset()
-    for text, seen in kept.items():
-        if found := difference(frozen[text], seen, "returned"):
-            raise Fault(f"what {text} returned is written again later: {found}")
-    for (text, seen), (later, then) in itertools.combinations(kept.items(), 2):
-        for key, other in itertools.product(seen, then):
-            if seen[key] is then[other] or _overlap(seen[key], then[other]):
+    for text, step in kept.items():
+        if found := difference(frozen[text], step, "returned"):
+            raise Fault(f"the return value of {text} is written to later: {found}")
+    for (text, step), (later, then) in itertools.combinations(kept.items(), 2):
+        for key, other in itertools.product(step, then):
+            if step[key] is then[other] or _overlap(step[key], then[other]):
                 raise Fault(f"{text} and {later} return the same memory ({key} and {other})")
-        for agent, other in itertools.combinations(seen.get("observations", {}), 2):
-            if _overlap(seen["observations"][agent], seen["observations"][other]):
+        for agent, other in itertools.combinations(step.get("observations", {}), 2):
+            if _overlap(step["observations"][agent], step["observations"][other]):
                 raise Fault(f"{text}: the observations of {agent!r} and {other!r} share memory")
     _survives_writing(subject)
 
 
 def pickled(subject: Subject) -> None:
-    """A pickled copy goes on bit for bit, and by itself."""
+    """A pickled copy continues bit for bit, independently."""
     _continues(subject, _pickled)
 
 
 def deepcopied(subject: Subject) -> None:
-    """A deep copy goes on bit for bit, and by itself."""
+    """A deep copy continues bit for bit, independently."""
     _continues(subject, copy.deepcopy)
 
 
 def _survives_writing(subject: Subject) -> None:
-    """Writing into what was returned, or into actions, changes nothing."""
+    """Check that writing into returned values or actions has no effect."""
     subject.require_repeatable()
     runs: list[list[dict[str, Any]]] = [[], []]
     for run, spoil in zip(runs, (False, True), strict=True):
         with global_generators_seeded():
             try:
-                for seen in play(subject.any(), _SHORT, subject.seed, reset_seed=subject.seed):
-                    run.append(copy.deepcopy(seen))
+                for step in play(subject.any(), _SHORT, subject.seed, reset_seed=subject.seed):
+                    run.append(copy.deepcopy(step))
                     if spoil:
-                        _spoil(seen)
+                        _spoil(step)
             except Exception as error:
                 if not spoil:
                     raise
-                text = "writing into what was returned, or into actions, makes a call raise"
+                text = "writing into returned values or actions makes a call raise"
                 raise Fault(f"{text} {described(error)}") from None
     if found := first_difference(*runs):
-        raise Fault(f"writing into what was returned, or into actions, changes what follows: {found}")
+        raise Fault(f"writing into returned values or actions changes later steps: {found}")
 
 
-def _spoil(seen: dict[str, Any]) -> None:
-    for array in arrays(list(seen.values())):
+def _spoil(step: dict[str, Any]) -> None:
+    for array in arrays(list(step.values())):
         if array.flags.writeable and array.dtype != object:
             array[...] = np.nan if array.dtype.kind == "f" else 0
-    for key, value in seen.items():
+    for key, value in step.items():
         if key != "actions" and value:
             value["__all__"] = value.pop(next(iter(value)))
 
 
 def _continues(subject: Subject, method: Callable[[ParallelEnv], ParallelEnv]) -> None:
-    """In the middle of an episode, over its end, and over resets that aren't seeded."""
+    """Compare a copy made in mid-episode with the original, across the end of the episode and unseeded resets."""
     subject.require_repeatable()
     env = subject.any()
     for _ in play(env, 4, subject.seed, reset_seed=subject.seed):
@@ -163,9 +163,9 @@ def _continues(subject: Subject, method: Callable[[ParallelEnv], ParallelEnv]) -
             except Exception as error:
                 if copied is env:
                     raise
-                raise Fault(f"copied after 4 steps, the copy can't go on: {described(error)}") from None
+                raise Fault(f"copied after 4 steps, the copy can't continue: {described(error)}") from None
     if found := first_difference(*runs):
-        raise Fault(f"copied after 4 steps, the original and its copy play different ones: {found}")
+        raise Fault(f"copied after 4 steps, original and copy differ: {found}")
 
 
 def _pickled(env: ParallelEnv) -> ParallelEnv:
@@ -178,5 +178,5 @@ def _overlap(first: Any, second: Any) -> bool:
 
 
 def _has_state(env: ParallelEnv) -> bool:
-    """True if there is a state(): that of PettingZoo's base class raises."""
+    """True if the environment implements state(); that of PettingZoo's base class raises."""
     return isinstance(getattr(env, "state_space", None), Space) or type(env).state is not ParallelEnv.state

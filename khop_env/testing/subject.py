@@ -1,4 +1,4 @@
-"""The environment that is checked, how more of it are made, and how it is played."""
+"""The environment under test: copies of it, and episodes with random actions."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ Chooser = Callable[[str, Space, Any], Any]
 
 
 class Fault(Exception):  # noqa: N818  # a result, which never leaves this package
-    """The environment breaks what a check asks of it."""
+    """The environment violates the checked property."""
 
 
 class Skip(Exception):  # noqa: N818
-    """A check doesn't apply."""
+    """The check doesn't apply."""
 
 
 class Subject:
     """An environment to check.
 
     Args:
-        env: the environment, or a function that makes one.
-        steps: in an episode or a comparison.
+        env: the environment, or a function that returns a new one.
+        steps: number of steps of an episode or a comparison.
         seed: the first seed.
 
     Raises:
-        ValueError: if it is no ParallelEnv, or a function that returns the same object twice.
+        ValueError: if `env` isn't a ParallelEnv, or is a function that returns the same object twice.
     """
 
     def __init__(self, env: Any, steps: int, seed: int) -> None:
@@ -50,53 +50,53 @@ class Subject:
             self._factory, env = env, env()
         self.env = require_parallel(env)
         if self._factory is not None and self.another() is self.env:
-            raise ValueError("the function returned one environment twice; it has to make a fresh one at each call")
+            raise ValueError("the function returned the same environment twice; it must return a new one at each call")
 
     @property
     def name(self) -> str:
-        """Its name in the report."""
+        """The environment's name in the report."""
         return str(self.env) if type(self.env).__str__ is not object.__str__ else type(self.env).__name__
 
     def another(self) -> ParallelEnv:
-        """A fresh environment of the same kind.
+        """A new environment of the same kind.
 
         Raises:
-            Skip: for an object that can be neither copied nor pickled.
+            Skip: if the object can be neither copied nor pickled.
         """
         made = self._copied() if self._factory is None else require_parallel(self._factory())
         self._made.append(made)
         return made
 
     def any(self) -> ParallelEnv:
-        """A fresh environment where there is another one, otherwise the object itself."""
+        """A new environment if possible, else the object itself."""
         try:
             return self.another()
         except Skip:
             return self.env
 
     def own(self) -> KHopEnv:
-        """A fresh environment of this library, without its wrappers.
+        """A new environment of this library, without wrappers.
 
         Raises:
-            Skip: for other environments.
+            Skip: if it isn't an environment of this library.
         """
         if not isinstance(self.env.unwrapped, KHopEnv):
-            raise Skip("only environments of khop_env can be seen as arrays and know who hears whom")
+            raise Skip("only environments of khop_env have an array form and a communication graph")
         return self.another().unwrapped
 
     def close(self) -> None:
-        """Close what was made."""
+        """Close all environments created here."""
         while self._made:
             self._made.pop().close()
 
     def require_repeatable(self) -> None:
-        """Only an environment that repeats itself, global generators restored, can be compared with a copy of itself.
+        """Require that two runs with the same seed are equal, as comparisons of copies need it.
 
         Raises:
-            Skip: if it doesn't.
+            Skip: if they differ.
         """
         if not self._repeatable:
-            raise Skip("two runs with the same seed differ by themselves (same_seed), so that nothing can be compared")
+            raise Skip("two runs with the same seed differ (see same_seed), so copies can't be compared")
 
     @functools.cached_property
     def _repeatable(self) -> bool:
@@ -117,11 +117,11 @@ class Subject:
                 if made is not self.env:
                     return made
                 errors.append(f"{how} returned the object itself")
-        raise Skip(f"needs a second environment; give a function that makes one: {'; '.join(errors)}")
+        raise Skip(f"needs a second environment; pass a function that returns a new one: {'; '.join(errors)}")
 
 
 def require_parallel(env: Any) -> ParallelEnv:
-    """The ParallelEnv inside what this library's other makers return.
+    """The ParallelEnv itself, or the one inside a wrapper of this library.
 
     Raises:
         ValueError: if there is none.
@@ -130,26 +130,26 @@ def require_parallel(env: Any) -> ParallelEnv:
         if isinstance(inner, ParallelEnv):
             return inner
     raise ValueError(
-        f"expected a PettingZoo ParallelEnv, or a function that makes one; got {type(env).__name__}; an AEC "
-        "environment becomes one by pettingzoo.utils.aec_to_parallel"
+        f"expected a PettingZoo ParallelEnv, or a function that returns one; got {type(env).__name__}; convert an "
+        "AEC environment by pettingzoo.utils.aec_to_parallel"
     )
 
 
 def play(
     env: ParallelEnv, steps: int, seed: int, *, reset_seed: int | None = None, begin: bool = True, choose: Any = None
 ) -> Iterator[dict[str, Any]]:
-    """Play episodes one after the other, of which only the first may be seeded.
+    """Run consecutive episodes, of which only the first may be seeded.
 
     Args:
         env: the environment.
-        steps: of all episodes together.
-        seed: of the actions, which are drawn from copies of the action spaces.
-        reset_seed: of the first reset.
-        begin: whether to reset first, or to go on.
-        choose: another `Chooser` than sampling.
+        steps: total number of steps.
+        seed: seed of the actions, which are drawn from copies of the action spaces.
+        reset_seed: seed of the first reset.
+        begin: whether to reset first; otherwise the current episode continues.
+        choose: a `Chooser`; by default actions are sampled.
 
     Yields:
-        What reset and step return, by name.
+        The return values of reset and step by name, with the actions.
     """
     spaces: dict[Any, Space] = {}
     for number, agent in enumerate(env.possible_agents):
@@ -158,23 +158,23 @@ def play(
     masks: dict[str, Any] = {}
     for _ in range(steps):
         if begin or not env.agents:
-            seen = _named(("observations", "infos"), env.reset(**({"seed": reset_seed} if begin else {})), "reset")
-            begin, masks = False, _masks(seen)
-            yield seen
+            step = _named(("observations", "infos"), env.reset(**({"seed": reset_seed} if begin else {})), "reset")
+            begin, masks = False, _masks(step)
+            yield step
         actions = {agent: (choose or _sample)(agent, spaces[agent], masks.get(agent)) for agent in env.agents}
         names = "observations", "rewards", "terminations", "truncations", "infos"
-        seen = _named(names, env.step(actions), "step")
-        masks = _masks(seen)
-        yield {**seen, "actions": actions}
+        step = _named(names, env.step(actions), "step")
+        masks = _masks(step)
+        yield {**step, "actions": actions}
 
 
 def record(env: ParallelEnv, steps: int, seed: int, **arguments: Any) -> list[dict[str, Any]]:
-    """Copies of all that `play` yields, which nobody writes into."""
-    return [copy.deepcopy(seen) for seen in play(env, steps, seed, **arguments)]
+    """Deep copies of everything that `play` yields."""
+    return [copy.deepcopy(step) for step in play(env, steps, seed, **arguments)]
 
 
 def first_difference(run: list[dict[str, Any]], again: list[dict[str, Any]]) -> str | None:
-    """The first difference between two recordings of the same play."""
+    """The first difference between two recordings of the same episodes."""
     for number, (first, second) in enumerate(zip(run, again, strict=False)):
         for key in first:
             if found := difference(first[key], second.get(key), key):
@@ -182,9 +182,9 @@ def first_difference(run: list[dict[str, Any]], again: list[dict[str, Any]]) -> 
     return None
 
 
-def called(number: int, seen: dict[str, Any]) -> str:
+def called(number: int, step: dict[str, Any]) -> str:
     """A call by its number: "call 3, step()"."""
-    return f"call {number}, {'step' if 'rewards' in seen else 'reset'}()"
+    return f"call {number}, {'step' if 'rewards' in step else 'reset'}()"
 
 
 def at_bound(end: str) -> Chooser:
@@ -202,7 +202,7 @@ def at_bound(end: str) -> Chooser:
 
 @contextmanager
 def global_generators_seeded() -> Iterator[None]:
-    """NumPy's and Python's global generators in a fixed state, and afterwards as they were."""
+    """Seed NumPy's and Python's global generators, and restore their states afterwards."""
     before = np.random.get_state(), random.getstate()  # noqa: NPY002
     np.random.seed(0)  # noqa: NPY002
     random.seed(0)
@@ -223,11 +223,11 @@ def _named(names: tuple[str, ...], returned: Any, method: str) -> dict[str, Any]
     return dict(zip(names, returned, strict=True))
 
 
-def _masks(seen: dict[str, Any]) -> dict[str, Any]:
-    """Action masks, which PettingZoo has in observations or in infos."""
+def _masks(step: dict[str, Any]) -> dict[str, Any]:
+    """Action masks, which PettingZoo environments put into observations or infos."""
     masks = {}
     for part in ("infos", "observations"):
-        for agent, value in seen[part].items():
+        for agent, value in step[part].items():
             if isinstance(value, dict) and "action_mask" in value:
                 masks[agent] = value["action_mask"]
     return masks

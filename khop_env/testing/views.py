@@ -1,4 +1,4 @@
-"""One environment of this library in all its forms: rows of batches and vectors, and the team as one agent."""
+"""Check that all forms of an environment agree: single, batched, vector, SB3 and the team as one agent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COPIES = 3
 
 
 def views(subject: Subject) -> str:
-    """Rows of all vector views are single environments."""
+    """Batched, vector, SB3 and joint forms equal single environments."""
     single = [subject.own() for _ in range(_COPIES)]
     seeds = list(range(subject.seed, subject.seed + _COPIES))
     expected = [[_flat(env, *env.reset(seed=seed))] for env, seed in zip(single, seeds, strict=True)]
@@ -32,7 +32,7 @@ def views(subject: Subject) -> str:
     _batched(copies(single[0], _COPIES), expected, actions, seeds)
     _joint(subject.own(), expected[0], actions[:, 0], seeds[0])
     if not single[0].batched.settings.uniform:
-        return "ragged observations have no rows: compared as a batch, and with the team as one agent"
+        return "ragged observations have no vector form: compared as a batch, and with the team as one agent"
     _vector(copies(single[0], _COPIES), expected, actions, seeds)
     if importlib.util.find_spec("stable_baselines3") is None:
         return "not compared as an SB3 VecEnv: Stable-Baselines3 isn't installed"
@@ -41,7 +41,7 @@ def views(subject: Subject) -> str:
 
 
 def copies(env: KHopEnv, num_envs: int) -> BatchedEnv:
-    """The same environment as arrays of `num_envs` copies."""
+    """The same environment as a `BatchedEnv` of `num_envs` environments."""
     batched, simulator = env.batched, env.batched.simulator
     many = Simulator(
         simulator.design,
@@ -60,7 +60,7 @@ def _by_agent(env: KHopEnv, flat: Any) -> dict[str, Any]:
 
 
 def _flat(env: KHopEnv, observations: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
-    """The values of reset or step, agents side by side."""
+    """Return values of reset or step, concatenated over agents."""
     agents = env.possible_agents
     flat = {"observations": np.concatenate([observations[agent] for agent in agents])}
     for name, values in zip(("rewards", "terminations", "truncations"), others[:-1], strict=False):

@@ -1,4 +1,4 @@
-"""A short training, shared by the tests of training and of what it leaves."""
+"""A short training run, shared by the tests of training and of its files."""
 
 import pytest
 

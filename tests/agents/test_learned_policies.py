@@ -1,4 +1,4 @@
-"""What a learned policy is shown, that it acts as the model it was saved from, and where it is refused."""
+"""Learned policies: their features, actions equal to those of the trained model, and refusals."""
 
 import dataclasses
 import json
@@ -41,7 +41,7 @@ def test_the_last_observation_is_scaled_like_the_others():
 
 
 def test_agents_with_a_heading_see_others_in_their_own_frame():
-    """Turned by their heading; integrators and carts as they stand."""
+    """Rotated into the own frame of agents with a heading; unchanged for integrators and carts."""
     env = batched("formation_v0", "mixed_fleet", num_envs=3)
     observations, _ = env.reset(0)
     features = ObservationScaler.of(describe(env), rates=True)(observations, observations)
@@ -60,7 +60,7 @@ def test_agents_with_a_heading_see_others_in_their_own_frame():
 
 @pytest.mark.parametrize("path", sorted(PRETRAINED.glob("*.npz")), ids=lambda path: path.stem)
 def test_scales_are_found_by_name(path):
-    """Those of the shipped policies, bit for bit; and columns in another order give the same features."""
+    """Features equal those of the shipped policies bit for bit, and don't depend on the order of columns."""
     policy = LearnedPolicy.load(path)
     env = batched(policy.environment, policy.about["scenario"], num_envs=2)
     description = describe(env)
@@ -125,7 +125,7 @@ def test_types_have_networks_of_their_own():
 
 
 def test_padded_slots_do_not_matter():
-    """Whatever stands in a slot that isn't valid, the scaled observation and so the action stay the same."""
+    """The content of an invalid slot changes neither the features nor the action."""
     env = batched("consensus_v0", "mixed_fleet", num_envs=2)
     observations, _ = env.reset(0)
     scaler = ObservationScaler.of(describe(env), rates=True)
@@ -137,8 +137,8 @@ def test_padded_slots_do_not_matter():
             if slot.startswith("slot") and int(slot[4:]) >= len(layout.slots) and rest != "valid":
                 spoilt[:, column] = rng.normal(size=2)
                 checked += 1
-        mine = observations[:, number]
-        np.testing.assert_array_equal(scaler(spoilt, mine), scaler(mine, mine))
+        own = observations[:, number]
+        np.testing.assert_array_equal(scaler(spoilt, own), scaler(own, own))
     assert checked
     heard = observations[:, 0].copy()
     heard[:, env.layouts[0].index("slot0.position.x")] += 1.0
@@ -177,28 +177,33 @@ def test_a_policy_that_does_not_fit_is_refused(trained, tmp_path):
             "consensus_v0",
             "paper",
             {},
-            "with 3 entries per action, here are .2.; train one for paper",
+            "with 3 entries per action; this environment has .2.; train a policy for paper",
         ),
         (
             "consensus_v0",
             "mixed_fleet",
             {"bounds": True},
-            "trained on mixed_fleet with .* columns of observations, here",
+            "trained on mixed_fleet with .* observation columns; this environment",
         ),
         ("consensus_v0", "mixed_fleet", {"uniform": False}, "needs uniform observations"),
-        ("consensus_v0", "mixed_fleet", {"control_period": 0.1}, "to act every 0.05 s, here agents act every 0.1 s"),
+        (
+            "consensus_v0",
+            "mixed_fleet",
+            {"control_period": 0.1},
+            "with a control period of 0.05 s; this environment has 0.1 s",
+        ),
     ):
         with pytest.raises(PolicyFileError, match=said):
             policy.reset(describe(batched(environment, scenario, num_envs=1, **arguments)), [0])
-    with pytest.raises(PolicyFileError, match="there is no policy"):
+    with pytest.raises(PolicyFileError, match="no policy file"):
         make_policy(f"ppo:{tmp_path / 'nothing'}")
     (tmp_path / "text.npz").write_text("no policy")
     with pytest.raises(PolicyFileError, match="isn't a policy that khop train wrote"):
         make_policy(f"ppo:{tmp_path / 'text.npz'}")
-    (tmp_path / "mine").mkdir()
-    policy.save(tmp_path / "mine" / "best.npz")
+    (tmp_path / "run").mkdir()
+    policy.save(tmp_path / "run" / "best.npz")
     with pytest.raises(ValueError, match="was trained by ppo"):
-        make_policy(f"sac:{tmp_path / 'mine'}")
+        make_policy(f"sac:{tmp_path / 'run'}")
     with pytest.raises(ValueError, match="say which, ppo:FOLDER or ppo:pretrained"):
         make_policy("ppo")
 
@@ -216,7 +221,7 @@ def test_no_policy_breaks_the_guarantee(environment, scenario):
 
 
 def test_a_learned_policy_is_run_filmed_and_compared(trained, tmp_path):
-    """The command line takes it where it takes the others, in the environment that it was trained for."""
+    """The command line accepts it wherever a scripted policy is accepted, in its training environment."""
     policy, film = f"ppo:{trained[1]}", tmp_path / "film.gif"
     run = ["run", "mixed_fleet", "--controller", policy]
     result = CliRunner().invoke(app, [*run, "--duration", "0.5", "--out", str(tmp_path), "--video", str(film)])
@@ -239,7 +244,7 @@ def test_a_learned_policy_is_run_filmed_and_compared(trained, tmp_path):
     assert result.stdout.count(policy[:20]) >= 3
     refused = CliRunner().invoke(app, [*evaluate, "--policies", policy])
     assert refused.exit_code == 2
-    assert "trained on mixed_fleet with 3 entries per action, here are [2]" in refused.stderr
+    assert "trained on mixed_fleet with 3 entries per action; this environment has [2]" in refused.stderr
 
 
 SHIPPED = sorted(PRETRAINED.glob("*.npz"))
@@ -247,13 +252,13 @@ SHIPPED = sorted(PRETRAINED.glob("*.npz"))
 
 def test_policies_are_shipped():
     assert len(SHIPPED) >= 4
-    with pytest.raises(PolicyFileError, match=r"no pretrained policy for .* on convoy; there are: .*Train"):
+    with pytest.raises(PolicyFileError, match=r"no pretrained policy for .* on convoy; available: .*To train"):
         make_policy("ppo:pretrained").reset(describe(batched("consensus_v0", "convoy", num_envs=1)), [0])
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_policies_are_small_and_good(path):
-    """Each under a megabyte, better than doing nothing by far, and much better on estimates than blind."""
+    """Each under a megabyte, far better than zero inputs, and much better on estimates than on neighbours only."""
     assert path.stat().st_size < 1_000_000
     about = LearnedPolicy.load(path).about
     environment, scenario = about["environment"], about["scenario"]

@@ -1,4 +1,4 @@
-"""Training: it learns, it is reproducible, it survives being killed, and what it saves acts as it did."""
+"""Training: it learns, is reproducible, survives a kill, and its saved policy acts as the trained model."""
 
 import dataclasses
 import json
@@ -34,7 +34,7 @@ def test_a_short_training_beats_random_and_zero():
     assert learned.mean() > 0.2 * max(random.mean(), zero.mean())  # returns are negative
     assert np.all(learned > np.maximum(random, zero))
     assert training.curve[-1].mean_return > training.curve[0].mean_return
-    assert max(one.max_normalized_disagreement for one in training.curve) < 1.0
+    assert max(point.max_normalized_disagreement for point in training.curve) < 1.0
 
 
 def test_the_same_seed_gives_the_same_curve(trained):
@@ -45,7 +45,7 @@ def test_the_same_seed_gives_the_same_curve(trained):
 def test_what_a_run_leaves(trained):
     training, folder = trained
     assert training.finished
-    assert [one.timesteps for one in training.curve][-1] >= SMALL.timesteps
+    assert training.curve[-1].timesteps >= SMALL.timesteps
     config = json.loads((folder / "config.json").read_text())
     assert (config["environment"], config["scenario"], config["seed"]) == ("consensus_v0", "mixed_fleet", 0)
     assert {"khop_env", "stable_baselines3", "torch", "numpy", "python"} <= set(config["versions"])
@@ -67,7 +67,7 @@ import sys
 from agents.learning import TrainingConfig
 from agents.learning.training import train
 config = TrainingConfig("consensus_v0", "mixed_fleet", timesteps=15_000, num_envs=16, evaluations=3, batch_size=512)
-train(config, sys.argv[1], resume="resume" in sys.argv, told=lambda part, found: print(part, flush=True))
+train(config, sys.argv[1], resume="resume" in sys.argv, on_progress=lambda part, found: print(part, flush=True))
 """
 
 
@@ -99,17 +99,17 @@ def test_the_horizon_is_bootstrapped():
     config = dataclasses.replace(SMALL, num_envs=8, n_steps=30, gamma=0.9)
     env = training_environment(config)
     model = make_model(config, env, [], None)
-    given, step = [], env.step_wait
+    steps, step = [], env.step_wait
 
     def recorded():
         observations, rewards, dones, infos = step()
-        given.append((rewards.copy(), dones.copy(), infos))
+        steps.append((rewards.copy(), dones.copy(), infos))
         return observations, rewards, dones, infos
 
     env.step_wait = recorded
     model.learn(30 * env.num_envs)
     ended = 0
-    for number, (rewards, dones, infos) in enumerate(given):
+    for number, (rewards, dones, infos) in enumerate(steps):
         expected = rewards.astype(np.float64)
         for row in np.flatnonzero(dones):
             assert infos[row]["TimeLimit.truncated"]
@@ -122,7 +122,7 @@ def test_the_horizon_is_bootstrapped():
 
 
 def test_huber_bounds_the_slope_of_the_reward():
-    """Far away the training reward is linear in the error, near the goal it is the environment's."""
+    """Far from the goal the training reward is linear in the error, near it equals the environment's reward."""
     config = dataclasses.replace(SMALL, environment="consensus_v0", scenario="paper", huber=1.0)
     env = training_environment(config)
     env.training, env.norm_reward = False, False
@@ -142,10 +142,10 @@ def test_huber_bounds_the_slope_of_the_reward():
         ({"algorithm": "dqn"}, "algorithm must be 'ppo' or 'sac'; got 'dqn'"),
         ({"observe": "truth"}, "observe must be one of"),
         ({"timesteps": 0}, "timesteps must be a positive integer; got 0"),
-        ({"seed": -1}, "seed must be an integer that isn't negative"),
+        ({"seed": -1}, "seed must be a non-negative integer"),
         ({"gamma": 1.5}, "gamma must be from 0 to 1; got 1.5"),
         ({"learning_rate": 0.0}, "learning_rate must be positive"),
-        ({"hidden": ()}, "hidden must be the widths"),
+        ({"hidden": ()}, "hidden must be the positive widths"),
         ({"algorithm": "sac", "per_type": True}, "per_type is for 'ppo'"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Policy files that come from anybody: good ones are read, and all others refused by name."""
+"""Policy files from untrusted sources: valid files are read, all others refused with their name."""
 
 import io
 import json
@@ -88,7 +88,7 @@ def mutated(rng):
 
 
 def test_every_mutation_is_refused_by_name_or_acts(tmp_path):
-    """Nothing else than a policy whose actions are in [-1, 1], or a PolicyFileError that names the file."""
+    """Either a policy with actions in [-1, 1], or a PolicyFileError that names the file."""
     rng, refused = np.random.default_rng(0), []
     env = batched("leader_following_v0", "mixed_fleet", num_envs=1)
     observations = dict(zip(env.agents, env.reset(0)[0].swapaxes(0, 1), strict=True))
@@ -111,11 +111,11 @@ def test_every_mutation_is_refused_by_name_or_acts(tmp_path):
 
 
 def with_member(name, content):
-    """The good file with another member, as bytes."""
+    """The content of a valid file with one member replaced."""
     stream = io.BytesIO()
     with zipfile.ZipFile(GOOD) as old, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as new:
-        for one in old.infolist():
-            new.writestr(one.filename, content if one.filename == name else old.read(one))
+        for member in old.infolist():
+            new.writestr(member.filename, content if member.filename == name else old.read(member))
         if name not in old.namelist():
             new.writestr(name, content)
     return stream.getvalue()
@@ -128,7 +128,7 @@ def npy(array, **options):
 
 
 class Payload:
-    """What a pickle runs when it is read."""
+    """Code that a pickle executes when it is loaded."""
 
     def __reduce__(self):
         return pytest.fail, ("a pickle was read",)
@@ -143,15 +143,15 @@ HUGE = npy(np.zeros(1)).replace(b"(1,), }" + b" " * 10, b"(99999999999,), }")
         (b"", "it is empty"),
         (npy(np.zeros(3)), "File is not a zip file"),
         (GOOD.read_bytes()[:-30], "File is not a zip file"),
-        (with_member("scale.npy", npy(np.array([Payload()]), allow_pickle=True)), "arrays of object"),
-        (with_member("scale.npy", HUGE), r"header says shape \(99999999999,\)"),
+        (with_member("scale.npy", npy(np.array([Payload()]), allow_pickle=True)), "array of object"),
+        (with_member("scale.npy", HUGE), r"doesn't match its header \(shape \(99999999999,\)"),
         (with_member("scale.npy", b"\x93NUMPY\x01\x00\x10\x27" + b"(" * 10000), "."),
         (with_member("meta.npy", npy(np.array('{"format": ' + "[" * 100_000))), "."),
         (with_member("planar.npy", npy(np.full((2, 2), 10**9))), "planar is out of range"),
         (with_member("moving.npy", npy(np.array([-1]))), "moving is out of range"),
         (with_member("rate.npy", npy(np.array(0.0))), "rate isn't positive"),
         (with_member("/0/bias.npy", npy(np.full(64, np.nan, np.float32))), "/0/bias isn't finite"),
-        (with_member("/0/bias.npy", npy(np.full(64, "1.0"))), "/0/bias has <U3 for float32"),
+        (with_member("/0/bias.npy", npy(np.full(64, "1.0"))), "/0/bias has dtype <U3; expected float32"),
     ],
     ids=range(12),
 )
@@ -163,14 +163,14 @@ def test_crafted_files_are_refused(tmp_path, content, said):
 
 
 def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
-    """By the size that it declares; and what declares less than it holds yields no more than it declares."""
+    """By the declared size; a file that declares less than it holds yields no more than it declares."""
     path = tmp_path / "bomb.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("scale.npy", "w") as member:
         for _ in range(300):
             member.write(bytes(2**20))
     assert path.stat().st_size < 2**20
     monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("it was unpacked"))
-    with pytest.raises(PolicyFileError, match="unpacked it would have 314,572,800 bytes, and at most 268,435,456"):
+    with pytest.raises(PolicyFileError, match="it would unpack to 314,572,800 bytes; the limit is 268,435,456"):
         make_policy(f"ppo:{path}")
     monkeypatch.undo()
     path.write_bytes(path.read_bytes().replace((300 * 2**20).to_bytes(4, "little"), (1000).to_bytes(4, "little")))
@@ -184,8 +184,8 @@ def test_archives_come_back_as_they_were(tmp_path):
     for compress in (True, False):
         write_arrays(tmp_path / "new" / "x.npz", arrays, compress=compress)
         found = read_arrays(tmp_path / "new" / "x.npz", 10_000)
-        assert {name: (one.dtype, one.shape, one.tobytes()) for name, one in found.items()} == {
-            name: (one.dtype, one.shape, one.tobytes()) for name, one in arrays.items()
+        assert {name: (array.dtype, array.shape, array.tobytes()) for name, array in found.items()} == {
+            name: (array.dtype, array.shape, array.tobytes()) for name, array in arrays.items()
         }
         assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.npz"]
     with pytest.raises(ArchiveError, match="isn't a regular file"):
@@ -193,7 +193,7 @@ def test_archives_come_back_as_they_were(tmp_path):
 
 
 def test_the_choice_between_several_shipped_policies_is_named(tmp_path, monkeypatch):
-    """One for the scenario is taken; of several one has to be named; and the order of files says nothing."""
+    """A single policy for the scenario is used; among several a name is required; file order is irrelevant."""
     from agents.running import policy_run
     from khop_env.registry import scenario
 
@@ -208,11 +208,11 @@ def test_the_choice_between_several_shipped_policies_is_named(tmp_path, monkeypa
     run = policy_run("ppo:pretrained/leader_following_v0", scenario("convoy"), "estimate", 1.0, 0)
     assert run.env.batched.task.name == "leader_following"
     with pytest.raises(
-        PolicyFileError, match="no pretrained policy for formation_v0 on convoy; there are: consensus_v0 "
+        PolicyFileError, match="no pretrained policy for formation_v0 on convoy; available: consensus_v0 "
     ):
         make_policy("ppo:pretrained/formation_v0").about_for("convoy")
     with pytest.raises(ValueError, match="no environment 'consensus'; did you mean 'consensus_v0'"):
         make_policy("ppo:pretrained/consensus")
     env = make_batched("consensus_v0", "convoy")
-    with pytest.raises(ValueError, match="the policy for leader_following_v0 was asked for, and this is consensus_v0"):
+    with pytest.raises(ValueError, match="the policy for leader_following_v0 doesn't fit consensus_v0"):
         play(env, make_policy("ppo:pretrained/leader_following_v0"), [0])

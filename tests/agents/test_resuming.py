@@ -1,4 +1,4 @@
-"""Continuing a training: only in the environment that it had, alone in its folder, and from files that run no code."""
+"""Resuming: only in the same environment, locked against other trainings, and from files that execute no code."""
 
 import contextlib
 import copy
@@ -37,7 +37,7 @@ def tiny(tmp_path_factory):
 
 @pytest.fixture
 def folder(tiny, tmp_path):
-    """A copy that may be spoilt."""
+    """A copy that may be modified."""
     for name in (CHECKPOINT, "best.npz", "curve.csv", "config.json"):
         (tmp_path / name).write_bytes((tiny[1] / name).read_bytes())
     return tmp_path
@@ -60,9 +60,9 @@ def test_a_finished_run_is_extended(tmp_path, changes):
 
 
 def test_an_edited_scenario_is_refused(tmp_path):
-    """By what differs; what an environment doesn't use may be edited."""
-    path, out = tmp_path / "mine.toml", tmp_path / "run"
-    text = write_scenario(scenario("mixed_fleet").replace(name="mine"))
+    """The message lists the differences; parts that an environment doesn't use may be edited."""
+    path, out = tmp_path / "edited.toml", tmp_path / "run"
+    text = write_scenario(scenario("mixed_fleet").replace(name="edited"))
     path.write_text(text)
     config = dataclasses.replace(TINY, scenario=str(path))
     curve = train(config, out).curve
@@ -89,8 +89,8 @@ def test_an_edited_scenario_is_refused(tmp_path):
 
 
 def test_one_training_at_a_time(tmp_path):
-    """Also of two processes; and the lock of a killed one is gone."""
-    with alone_in(tmp_path), pytest.raises(FileExistsError, match=f"another training is going on in {tmp_path}: wait"):
+    """Also between two processes; the lock of a killed process is released."""
+    with alone_in(tmp_path), pytest.raises(FileExistsError, match=f"another training is running in {tmp_path}: wait"):
         train(TINY, tmp_path)
     code = "import sys, time; from pathlib import Path; from agents.learning.run_folder import alone_in\n"
     code += "with alone_in(Path(sys.argv[1])): print('locked', flush=True); time.sleep(600)"
@@ -98,7 +98,7 @@ def test_one_training_at_a_time(tmp_path):
     assert process.stdout.readline() == "locked\n"
     result = CliRunner().invoke(app, ["train", "consensus_v0", "--timesteps", "9", "--out", str(tmp_path)])
     assert result.exit_code == 2
-    assert f"khop: another training is going on in {tmp_path}" in result.stderr
+    assert f"khop: another training is running in {tmp_path}" in result.stderr
     assert not (tmp_path / "config.json").exists()
     process.kill()
     process.communicate()
@@ -116,14 +116,14 @@ ROOT = Path(__file__).parents[2]
 
 
 class Payload:
-    """What a pickle runs when it is read."""
+    """Code that a pickle executes when it is loaded."""
 
     def __reduce__(self):
         return os.mkdir, ("pickle-was-read",)
 
 
 def test_resuming_reads_no_pickle(folder, monkeypatch):
-    """Neither one that is put in place of the checkpoint, or into it, nor any of its own."""
+    """Neither instead of the checkpoint, nor inside it; and checkpoints contain none."""
     whole = (folder / CHECKPOINT).read_bytes()
     monkeypatch.chdir(folder)
     (folder / CHECKPOINT).write_bytes(pickle.dumps(Payload()))
@@ -132,7 +132,7 @@ def test_resuming_reads_no_pickle(folder, monkeypatch):
     (folder / CHECKPOINT).write_bytes(whole)
     arrays = read_arrays(folder / CHECKPOINT, 2**24)
     write_arrays(folder / CHECKPOINT, {**arrays, "1": np.array([Payload()])}, compress=False)
-    with pytest.raises(CheckpointError, match=rf"{CHECKPOINT} isn't a checkpoint .*arrays of object"):
+    with pytest.raises(CheckpointError, match=rf"{CHECKPOINT} isn't a checkpoint .*array of object"):
         train(TINY, folder, resume=True)
     assert not (folder / "pickle-was-read").exists()
     (folder / CHECKPOINT).write_bytes(whole)
@@ -163,7 +163,7 @@ def changed(tree, path, value):
 
 
 def test_crafted_checkpoints_are_refused(tiny, tmp_path):
-    """Wherever a value is another: a CheckpointError, or a state that training goes on from."""
+    """Any changed value gives a CheckpointError, or a state that training continues from."""
     run, content = _Run(TINY, None, None, None), read_checkpoint(tiny[1] / CHECKPOINT)
     content = {key: content[key] for key in ("model", "environment", "rewards", "before", "curve", "seconds")}
     places = [path for path in leaves(content) if "python" not in path]  # 625 numbers of a generator
@@ -188,7 +188,7 @@ import sys, threading, os, signal
 from agents.learning import TrainingConfig
 from agents.learning.training import train
 config = TrainingConfig("consensus_v0", "mixed_fleet", num_envs=2, evaluations=1, **eval(sys.argv[2]))
-print(train(config, sys.argv[1], told=lambda part, found: print(part, flush=True)).finished)
+print(train(config, sys.argv[1], on_progress=lambda part, found: print(part, flush=True)).finished)
 """
 
 

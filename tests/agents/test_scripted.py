@@ -1,4 +1,4 @@
-"""Scripted policies: the law of the simulator on observations, nothing beyond them, and progress everywhere."""
+"""Scripted policies: the simulator's law on observations alone, with progress in every environment."""
 
 import numpy as np
 import pytest
@@ -18,14 +18,14 @@ PARAMETERS = {  # all of them, so that no shipped ones are used
 
 
 def true_view(env):
-    """What the law would be shown if the acting agents were a fleet of their own, from the simulator's numbers."""
+    """The view that the law would get if the acting agents were a fleet of their own, from the simulator's arrays."""
     fleet, task, simulator = env.fleet, env.task, env.simulator
     design, x = simulator.design, simulator.x
     number = {fleet.agent(agent): place for place, agent in enumerate(env.agents)}
     edges, known, displacement = [], [], []
     for layout in env.layouts:
         i = fleet.agent(layout.agent)
-        for slot in (one for one in layout.slots if one.task_edge):
+        for slot in (each for each in layout.slots if each.task_edge):
             j = slot.agent
             edge = np.flatnonzero((task.edges == (i, j)).all(axis=1))[0]
             columns = fleet.position_index[j]
@@ -61,12 +61,12 @@ def test_a_policy_does_what_its_law_does(environment, scenario, observe, uniform
     policy_law = make_law(LawChoice(law, parameters))
     expected = policy_law(np.full(3, 0.0), view) / acting.input_limit
     for number, (agent, size) in enumerate(describe(env).action_sizes.items()):
-        mine = expected[:, acting.input_slice(number)]
+        own = expected[:, acting.input_slice(number)]
         assert actions[agent].shape == (3, size)
         assert actions[agent].dtype == np.float32
         assert np.all(np.abs(actions[agent]) <= 1.0)
-        np.testing.assert_allclose(actions[agent][:, : mine.shape[1]], mine, atol=2e-4)
-        assert not actions[agent][:, mine.shape[1] :].any()
+        np.testing.assert_allclose(actions[agent][:, : own.shape[1]], own, atol=2e-4)
+        assert not actions[agent][:, own.shape[1] :].any()
 
 
 @pytest.mark.parametrize("name", [*LAWS, "zero", "random", "bang_bang"])
@@ -76,24 +76,24 @@ def test_one_observation_or_a_batch(name):
         parallel("leader_following_v0", "mixed_fleet"),
         batched("leader_following_v0", "mixed_fleet", num_envs=3),
     )
-    one, other = make_policy(name), make_policy(name)
-    one.reset(describe(single), seeds=[1])
-    other.reset(describe(several), seeds=[0, 1, 2])
+    policy, batch_policy = make_policy(name), make_policy(name)
+    policy.reset(describe(single), seeds=[1])
+    batch_policy.reset(describe(several), seeds=[0, 1, 2])
     seen, _ = single.reset(seed=1)
     rows, _ = several.reset(0)
     for _ in range(20):
-        mine, theirs = one.act(seen), other.act(by_agent(several, rows))
+        actions, batched_actions = policy.act(seen), batch_policy.act(by_agent(several, rows))
         for agent in single.agents:
-            assert mine[agent].shape == single.action_space(agent).shape
-            np.testing.assert_array_equal(mine[agent], theirs[agent][1])
-        seen, *_ = single.step(mine)
-        rows, *_ = several.step(np.stack([theirs[agent] for agent in several.agents], axis=1))
+            assert actions[agent].shape == single.action_space(agent).shape
+            np.testing.assert_array_equal(actions[agent], batched_actions[agent][1])
+        seen, *_ = single.step(actions)
+        rows, *_ = several.step(np.stack([batched_actions[agent] for agent in several.agents], axis=1))
 
 
 @pytest.mark.parametrize("name", [*LAWS, "zero", "random", "bang_bang"])
 @pytest.mark.parametrize("observe", ["estimate", "local"])
 def test_a_policy_sees_nothing_beyond_its_observation(name, observe):
-    """What i can't know is changed: i acts as before. (On the truth it doesn't: so the test can fail.)"""
+    """Changes of states that i has no access to don't change its action; in oracle mode they do."""
     for mode, alike in ((observe, True), ("oracle", name in ("zero", "random", "bang_bang"))):
         env = parallel("consensus_v0", "paper", observe=mode)
         policy = make_policy(name)
@@ -119,7 +119,7 @@ def env_observations(env):
 
 
 class Spy:
-    """Tries to rebuild its environment from what it is told, and to read the truth there."""
+    """Tries to rebuild its environment from the description, and to read the true state there."""
 
     def __init__(self):
         self.twins = []
@@ -135,7 +135,7 @@ class Spy:
 
 
 def test_a_policy_can_not_rebuild_its_episode():
-    """The seeds that it is given for its own random numbers aren't the environment's."""
+    """The seeds for a policy's own random numbers differ from the environment's."""
     env, spy = batched("consensus_v0", "convoy", num_envs=3), Spy()
     play(env, spy, range(3))
     truth = env.reset(range(3))[0]
@@ -165,7 +165,7 @@ def test_what_a_policy_is_told_holds_no_environment():
 @pytest.mark.parametrize(("environment", "scenario"), EVERY)
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_makes_progress_everywhere(environment, scenario, law):
-    """With the shipped parameters: much nearer to the goal than at the start, and close to what the truth gives."""
+    """With the shipped parameters: much nearer to the goal than at the start, close to the result in oracle mode."""
     estimate, oracle = (
         play(batched(environment, scenario, num_envs=8, observe=mode), make_policy(law), range(8))
         for mode in ("estimate", "oracle")
@@ -234,7 +234,7 @@ def test_shipped_parameters_are_used_and_given_ones_win():
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_leader_out_of_sight_is_awaited_at_the_origin(mode):
-    """Followers that know nothing of their leaders keep near the origin instead of drifting off."""
+    """Followers without information on their leaders stay near the origin instead of drifting off."""
     env = batched("leader_following_v0", "convoy", num_envs=4, observe=mode)
     play(env, make_policy("leader_following:gain=4"), range(4))
     positions = env.fleet.positions(env.simulator.x)

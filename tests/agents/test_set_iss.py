@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents import ComparisonGain, LinearConsensus, TanhConsensus, analytical_gain, injected_errors, swept_bounds
-from agents.set_iss import Misinformed, slope, with_final_bounds
+from agents.set_iss import PerturbedLaw, slope, with_final_bounds
 from khop_env.observers import Exponential
 from khop_env.physics import SingleIntegrator
 from khop_env.results import consensus_error
 from khop_env.scenarios import LawChoice, mixed_fleet, paper, random_geometric
 
 
-def unheard_edges(scenario):
+def estimated_edges(scenario):
     edges = sorted([*scenario.task.edges, *((j, i) for i, j in scenario.task.edges)])
     return np.array([not scenario.communication.has_edge(i, j) for i, j in edges])
 
@@ -29,14 +29,14 @@ def unheard_edges(scenario):
     drifting=st.booleans(),
 )
 def test_set_iss_inequality_along_runs(law, size, radius, seed, drifting):
-    """|e(t)| stays below the comparison equation's solution, whatever the errors of that size do."""
+    """|e(t)| stays below the solution of the comparison equation, for all errors of that norm."""
     scenario = paper().replace(disturbance=None, radius=radius, duration=2.0)
     if not drifting:
         scenario = scenario.replace(models=(SingleIntegrator(input_limit=20.0),) * 8)
     gain = law.set_iss_gain(scenario)
     assert gain is not None
     batch = 6
-    seen = Misinformed(law, size, unheard_edges(scenario), np.random.default_rng(seed), batch, 2)
+    seen = PerturbedLaw(law, size, estimated_edges(scenario), np.random.default_rng(seed), batch, 2)
     simulator = scenario.build(law=seen, observe="oracle", num_envs=batch)
     simulator.reset(seed)
     limit = consensus_error(simulator.fleet, simulator.x)
@@ -70,7 +70,7 @@ def test_ultimate_distance_solves_its_equation(coupling, share, weight, error, b
 
 
 def test_gain_of_the_paper():
-    """k_c lambda_2(L_T), l_f and k_c sqrt(most unheard task edges), worked out by hand from the graphs."""
+    """k_c lambda_2(L_T), l_f and k_c sqrt(most task edges to non-neighbours), worked out by hand from the graphs."""
     scenario = paper()
     gain = analytical_gain(scenario)
     laplacian = np.zeros((8, 8))
@@ -128,8 +128,8 @@ def test_tighter_bounds_bring_the_team_nearer(scenario, capsys):
 
 def test_final_bounds_alone_change():
     for scenario in (paper(), mixed_fleet()):
-        one, other = (list(each.design.states.bounds) for each in (scenario, with_final_bounds(scenario, 0.1)))
-        for before, after in zip(one, other, strict=True):
+        bounds, scaled = (list(each.design.states.bounds) for each in (scenario, with_final_bounds(scenario, 0.1)))
+        for before, after in zip(bounds, scaled, strict=True):
             assert isinstance(after, Exponential)
             assert after.final == pytest.approx(0.1 * before.final)
             assert after.initial - after.final == pytest.approx(before.initial - before.final)

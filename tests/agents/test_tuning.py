@@ -1,4 +1,4 @@
-"""Tuning finds what a fine grid finds, and what is shipped was found by it."""
+"""Tuning agrees with a fine grid search, and the shipped parameters are the result of tuning."""
 
 import math
 import tomllib
@@ -58,7 +58,7 @@ def test_shipped_parameters_are_better_than_the_defaults(environment, scenario):
 @pytest.mark.parametrize(("environment", "scenario"), EVERY)
 @pytest.mark.parametrize("law", LAWS)
 def test_parameters_hold_at_longer_control_periods(environment, scenario, law):
-    """What was tuned at 0.05 s is used there as it stands, and costs no multiple of it at 0.2 s."""
+    """Gains tuned at 0.05 s are unchanged there, and the cost at 0.2 s isn't a multiple of it."""
     returns, gains = {}, {}
     for period in (0.02, 0.05, 0.2):
         env = batched(environment, scenario, num_envs=8, control_period=period, max_cycles=round(6.0 / period))
@@ -75,8 +75,8 @@ def test_parameters_hold_at_longer_control_periods(environment, scenario, law):
 
 
 def test_a_default_gain_is_lowered_on_long_periods():
-    """Scenarios that nothing was tuned for, too: 1 / (edges x period) for laws that add up edges."""
-    env = consensus_v0.batched_env(by_name("paper").replace(name="mine"), control_period=0.4)
+    """Also for scenarios without tuned parameters: 1 / (edges x period) for laws that sum over edges."""
+    env = consensus_v0.batched_env(by_name("paper").replace(name="untuned"), control_period=0.4)
     most = max(sum(slot.task_edge for slot in layout.slots) for layout in env.layouts)
     assert most > 1
     for law, expected in (("tanh", 1.0 / (most * 0.4)), ("leader_following", 1.0 / 0.4)):

@@ -1,4 +1,4 @@
-"""Several processes: they end with the caller, their death is noticed, and what was done until then is kept."""
+"""Several processes: they end with the caller, their death is detected, and results until then are kept."""
 
 import contextlib
 import io
@@ -38,7 +38,7 @@ def alive(pid):
 
 
 def doing(task):
-    """What a worker does in these tests."""
+    """The function that workers run in these tests."""
     what, value = task
     if what == "wait":
         time.sleep(600)
@@ -58,7 +58,7 @@ def test_every_task_is_done_once():
     assert not any(alive(pid) for pid in found.values())
     with pytest.raises(ValueError, match="no luck"):
         list(run_in_processes(doing, [("fail", "luck"), ("wait", 0)], 2))
-    with pytest.raises(ValueError, match="can't be sent to other processes, take one worker"):
+    with pytest.raises(ValueError, match="can't be sent to other processes; use workers=1"):
         list(run_in_processes(lambda task: task, [1], 2))
 
 
@@ -85,20 +85,20 @@ def test_workers_end_where_nobody_waits_for_them():
 
 
 def test_comparisons_in_threads_are_those_of_one_thread():
-    """Each has environments of its own."""
+    """Each comparison has environments of its own."""
     calls = [{"policies": [law], "seeds": range(12), "observe": [mode]} for law in ("tanh", "random", "linear")
              for mode in ("estimate", "local")]  # fmt: skip
     alone = [compare("consensus_v0", **call, arguments={"max_cycles": 60}).summary() for call in calls]
     with ThreadPoolExecutor(6) as threads:
         found = list(threads.map(lambda call: compare("consensus_v0", **call, arguments={"max_cycles": 60}), calls))
-    assert [one.summary() for one in found] == alone
+    assert [comparison.summary() for comparison in found] == alone
 
 
 def test_an_edited_scenario_file_is_read_again(tmp_path):
-    path, found = tmp_path / "mine.toml", []
+    path, found = tmp_path / "edited.toml", []
     for radius in (1.0, 0.25):
         chosen = scenario("paper")
-        chosen = chosen.replace(name="mine", radius=radius * chosen.radius)
+        chosen = chosen.replace(name="edited", radius=radius * chosen.radius)
         path.write_text(write_scenario(chosen))
         asked = {"policies": ["zero"], "seeds": range(2), "arguments": {"max_cycles": 3}}
         found.append(compare("consensus_v0", scenario=path, **asked).summary())
@@ -107,7 +107,7 @@ def test_an_edited_scenario_file_is_read_again(tmp_path):
 
 
 def interrupting(after):
-    """A progress that presses Ctrl-C at its n-th call."""
+    """A progress callback that raises KeyboardInterrupt at its n-th call."""
     calls = []
 
     def progress(_):
@@ -119,7 +119,7 @@ def interrupting(after):
 
 
 def test_what_was_played_is_kept():
-    """Rows that are finished, and of others the first episodes; equal to those of a whole comparison."""
+    """Finished rows, and the first episodes of others, equal to those of an uninterrupted comparison."""
     call = {"policies": ["tanh", "zero"], "observe": ["local"], "seeds": range(60), "arguments": {"max_cycles": 4}}
     whole = compare("consensus_v0", **call)
     with pytest.raises(Interrupted) as caught:
@@ -163,7 +163,7 @@ main()
 
 
 def children(pid):
-    return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 EVALUATE = ("evaluate", "consensus_v0", "--policies", "zero", "--observe", "estimate", "--episodes", "100000")
@@ -180,7 +180,7 @@ EVALUATE = ("evaluate", "consensus_v0", "--policies", "zero", "--observe", "esti
     ids=["workers", "evaluate", "tune", "iss"],
 )
 def test_ctrl_c_on_the_command_line(tmp_path, arguments, calls, printed, said):
-    """As a terminal sends it, to all processes of the group: a table, a line, status 130, and nobody is left."""
+    """Sent to the whole process group, as by a terminal: a table, a message, status 130, and no process is left."""
     process = subprocess.Popen(
         [sys.executable, "-W", "ignore", "-c", COMMAND, *arguments],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
@@ -209,7 +209,7 @@ def test_ctrl_c_on_the_command_line(tmp_path, arguments, calls, printed, said):
 
 
 def test_a_killed_worker_on_the_command_line(monkeypatch):
-    """One line, status 2, and what was played."""
+    """One line, status 2, and the rows until then."""
 
     calls = []
 
@@ -222,14 +222,14 @@ def test_a_killed_worker_on_the_command_line(monkeypatch):
     result = CliRunner().invoke(app, [*EVALUATE, "--workers", "2"])
     assert result.exit_code == 2
     assert result.stderr == (
-        "khop: a worker process was killed by SIGKILL (where memory is short, use fewer); above is what was played "
+        "khop: a worker process was killed by SIGKILL (use fewer workers if memory is short); above is what was played "
         "until then\n"
     )
     assert re.search(r"zero \(\d+ episodes\)", result.stdout)
 
 
 def test_a_policy_that_fails_on_the_way(monkeypatch):
-    """Its error is told, and the rows before it are kept."""
+    """The message has its error, and the rows before it are kept."""
     played = []
 
     def play(env, policy, seeds, *, name):

@@ -1,4 +1,4 @@
-"""What the tests of the environments share: which there are, how to play them, and what equal means."""
+"""Common to the tests of environments: all environments, how to play them, and equality bit for bit."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def play(env: KHopEnv, cycles: int, seed: int = 0, scale: float = 1.0) -> list[A
 
 
 def same(first: Any, second: Any) -> bool:
-    """Whether two nests of dicts, sequences, dataclasses, arrays and numbers are equal bit for bit, types included."""
+    """True if two nests of dicts, sequences, dataclasses, arrays and numbers are equal bit for bit, types included."""
     return difference(first, second) is None
 
 

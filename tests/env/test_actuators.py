@@ -1,4 +1,4 @@
-"""What stands between an action and the input: each actuator's own law, through env.step."""
+"""Actuators between action and input: each one's equation, through env.step."""
 
 import itertools
 import math
@@ -20,7 +20,7 @@ def made(actuator, name="mixed_fleet", **arguments):
     return parallel("consensus_v0", name, actuator=actuator, **arguments)
 
 
-def watched(env):
+def recorded(env):
     """The inputs that the simulator is stepped with, as fractions of the limits, one (m,) per substep."""
     simulator, seen = env.batched.simulator, []
     advance = simulator.advance
@@ -48,7 +48,7 @@ def commands(env, actions):
 def run(env, cycles=6):
     """(commands, inputs) per substep of random actions."""
     env.reset(seed=0)
-    seen, asked = watched(env), []
+    seen, asked = recorded(env), []
     rng = np.random.default_rng(1)
     for _ in range(cycles):
         actions = random_actions(env, rng, 1.5)

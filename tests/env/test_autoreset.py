@@ -227,7 +227,10 @@ def test_a_mask_resets_its_copies_only(mode):
         (np.ones(3, bool), r"must be an array of 24 bool, one per row; got bool of shape \(3,\)"),
         (np.ones(24), r"must be an array of 24 bool, one per row; got float64 of shape \(24,\)"),
         (np.zeros(24, bool), "has no True: there is nothing to reset"),
-        (np.arange(24) < 9, "rows 8 to 15 are the agents of copy 1, which are reset together: mask all or none; got"),
+        (
+            np.arange(24) < 9,
+            "rows 8 to 15 are the agents of environment 1, which are reset together: mask all or none; got",
+        ),
     ],
 )
 def test_masks_that_do_not_fit_are_refused_and_change_nothing(mask, message):
@@ -245,7 +248,9 @@ def test_without_autoreset_an_ended_copy_has_to_be_reset():
     env.step(actions[0])
     rows, _, _, truncated, _ = env.step(actions[1])
     assert truncated.all()
-    with pytest.raises(ValueError, match=r"no episode is running in 3 of 3 copies, the first 0: call reset\(\) first"):
+    with pytest.raises(
+        ValueError, match=r"no episode is running in 3 of 3 environments, the first 0: call reset\(\) first"
+    ):
         env.step(actions[2])
     assert same(env.batched.observations().reshape(24, -1), rows)
 

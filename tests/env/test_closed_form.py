@@ -19,7 +19,7 @@ LAPLACIAN = nx.laplacian_matrix(TASK, nodelist=range(AGENTS)).toarray().astype(f
 
 
 def scenario(model):
-    """Five agents that hear or estimate all others, without disturbance."""
+    """Five agents that are neighbours of all others or estimate them, without disturbance."""
     task = nx.Graph()
     task.add_nodes_from(range(AGENTS))
     task.add_edges_from(TASK.edges)

@@ -1,4 +1,4 @@
-"""What an environment promises beyond the libraries' own tests, which let NaN and shared memory pass."""
+"""The contract of environments beyond the libraries' own tests, which let NaN and shared memory pass."""
 
 import copy
 import itertools

@@ -1,4 +1,4 @@
-"""An agent's observation depends on itself, on whom it hears, and on its own estimates, and on nothing else."""
+"""An agent's observation depends on itself, on its neighbours, and on its own estimates, and on nothing else."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def in_mid_episode(environment, name, **arguments):
     return env, env.batched.fleet.ids
 
 
-def hears(env, i):
+def within_one_hop(env, i):
     """The agents within one hop of i, itself included, from the graph alone."""
     return {i, *env.batched.simulator.design.communication[i]}
 
@@ -41,13 +41,13 @@ def moved(part):
 @pytest.mark.parametrize("observe", ["estimate", "local"])
 @every
 def test_the_true_state_of_an_unheard_agent_changes_nothing(environment, name, observe, uniform):
-    """For every pair, leaders included: i's observation changes with j's state exactly if i hears j, or is j."""
+    """For every pair, leaders included: i's observation changes with j's state exactly if i is j or its neighbour."""
     env, ids = in_mid_episode(environment, name, observe=observe, uniform=uniform)
     acting = {env.batched.fleet.agent(agent) for agent in env.possible_agents}
     pairs = 0
     for j in range(len(ids)):
         seen_by = changed(env, moved(env.batched.fleet.state_slice(j)))
-        assert seen_by == {i for i in acting if j in hears(env, i)}, ids[j]
+        assert seen_by == {i for i in acting if j in within_one_hop(env, i)}, ids[j]
         pairs += len(acting) - len(seen_by)
     assert pairs > 0
 
@@ -103,7 +103,7 @@ def test_estimates_show_in_no_other_mode(environment, name, observe):
 
 @every
 def test_inputs_draws_and_solver_states_show_to_nobody_else(environment, name):
-    """What others do, the disturbance and the observers' inner states stay hidden; a lagging input is its owner's."""
+    """Other agents' inputs, the disturbance and the observers' inner states aren't observed; own inputs are."""
     env, ids = in_mid_episode(environment, name, actuator="lag")
     fleet = env.batched.fleet
 

@@ -1,4 +1,4 @@
-"""What the PettingZoo environment refuses, in words that help, and that a refusal leaves no trace."""
+"""Errors of the PettingZoo environment: helpful messages, and no change of its state."""
 
 import math
 import re
@@ -218,7 +218,7 @@ WRONG_SETTINGS = {
 
 @pytest.mark.parametrize("name", WRONG_SETTINGS)
 def test_wrong_settings_are_refused(name):
-    """What was given, and what is expected."""
+    """The message has the value and the valid range."""
     value, message = WRONG_SETTINGS[name]
     with pytest.raises(ValueError, match=message):
         consensus_v0.parallel_env(**{name: value})
@@ -289,7 +289,7 @@ def test_agents_without_input_limits_are_refused():
 
 
 def test_several_copies_are_no_parallel_environment():
-    with pytest.raises(ValueError, match="a ParallelEnv is one copy; got 2: use make_vec for several"):
+    with pytest.raises(ValueError, match="a ParallelEnv is one environment; got num_envs=2: use make_vec for several"):
         parallel("consensus_v0", num_envs=2)
 
 

@@ -1,4 +1,4 @@
-"""Frames show what they say: agents at their places, ghosts in boxes as wide as the bound, and no trace of the past."""
+"""Frames: agents at their positions, estimates in boxes as wide as the bound, and nothing of earlier episodes."""
 
 import copy
 import pickle
@@ -14,9 +14,9 @@ from khop_env.env.rendering.scene import (
     COLORS,
     EDGE_COLOR,
     TASK_COLOR,
-    Beliefs,
+    Estimates,
+    default_observer,
     looks,
-    neediest,
     short_names,
 )
 from khop_env.observers import Exponential, ObserverDesign
@@ -46,7 +46,7 @@ def renderer(**options) -> Renderer:
 
 
 def scene(t=0.0, x=(0.0, 0.0, 3.0, 1.0, 1.0, -2.0), offset=0.0, normalized=0.5):
-    """Arguments of `frame`: each agent believed to be `offset` metres off in both coordinates."""
+    """Arguments of `frame`: each agent's estimate `offset` metres off in both coordinates."""
     x = np.array(x)
     return t, x, x[design().states.layout.column_source] + offset, normalized
 
@@ -95,27 +95,27 @@ class TestFrame:
 
     @pytest.mark.parametrize("t", [0.8, 1.0, 9.0])
     def test_boxes_are_as_wide_as_the_bound(self, t):
-        """Agent 0 believes agent 2 to be 0.2 m off; the bound's edges stand delta(t) from the belief."""
+        """Agent 0's estimate of agent 2 is 0.2 m off; the bound's edges are delta(t) from the estimate."""
         drawn = renderer(observer=0)
         frame = drawn.frame(*scene(t, offset=0.2))
-        believed, delta = np.array([1.2, -1.8]), DELTA(t)
+        estimated, delta = np.array([1.2, -1.8]), DELTA(t)
         steps = np.arange(-8, 9)  # pixels across the edge
         for side in ((-1.0, -0.5), (1.0, -0.5), (0.0, -1.0), (0.0, 1.0)):  # where nothing else is drawn
-            edge, outwards = believed + delta * np.array(side), np.trunc(side)
+            edge, outwards = estimated + delta * np.array(side), np.trunc(side)
             red = [at(drawn, frame, edge + n * drawn._camera.meters * outwards)[0] for n in steps]
             assert min(red) < 130, "no edge there"
             assert abs(steps[np.argmin(red)]) <= 1
-        inside, outside = believed + 0.8 * delta * np.array([1, -1]), believed + 1.1 * delta * np.array([1, -1])
+        inside, outside = estimated + 0.8 * delta * np.array([1, -1]), estimated + 1.1 * delta * np.array([1, -1])
         assert at(drawn, frame, inside)[0] < at(drawn, frame, outside)[0]  # tinted
 
     def test_boxes_larger_than_the_view_are_counted(self):
         drawn = renderer(observer=0)
         drawn.frame(*scene(0.0))
-        believed = np.array([[1.0, -2.0]])
-        assert drawn._draw_boxes(drawn._canvas, 0.0, believed) == 1
-        assert drawn._draw_boxes(drawn._canvas, 9.0, believed) == 0
+        estimated = np.array([[1.0, -2.0]])
+        assert drawn._draw_boxes(drawn._canvas, 0.0, estimated) == 1
+        assert drawn._draw_boxes(drawn._canvas, 9.0, estimated) == 0
 
-    def test_a_ghost_is_drawn_at_the_belief(self):
+    def test_an_estimate_is_drawn_as_a_hollow_marker(self):
         drawn = renderer(observer=0)
         apart = drawn.frame(*scene(1.0, offset=0.4))
         radius = 1.55 * drawn._radius * drawn._camera.meters
@@ -169,10 +169,10 @@ class TestFrame:
 
 
 class TestWhoIsShown:
-    def test_the_neediest_by_default(self):
+    def test_the_agent_with_most_edges_to_targets_by_default(self):
         fleet = design((SingleIntegrator(),) * 5, k=4)
-        assert neediest(fleet, np.array([[0, 1], [1, 0], [3, 1], [3, 0], [4, 0]])) == 3
-        assert neediest(fleet, np.array([[4, 0], [2, 0]])) == 2
+        assert default_observer(fleet, np.array([[0, 1], [1, 0], [3, 1], [3, 0], [4, 0]])) == 3
+        assert default_observer(fleet, np.array([[4, 0], [2, 0]])) == 2
         assert Renderer(fleet, np.zeros((0, 2), int)).observer == 0
 
     def test_beliefs_are_each_target_s_own(self):
@@ -185,16 +185,16 @@ class TestWhoIsShown:
         mixed = ObserverDesign(fleet, nx.path_graph(5), 4, bounds, Exponential(5.0, 1.0, 5.0))
         estimates = np.random.default_rng(0).normal(size=mixed.states.layout.size)
         for observer in range(5):
-            beliefs = Beliefs(mixed, observer)
-            assert tuple(beliefs.targets) == mixed.neighborhoods[observer]
-            for number, j in enumerate(beliefs.targets):
+            drawn = Estimates(mixed, observer)
+            assert tuple(drawn.targets) == mixed.neighborhoods[observer]
+            for number, j in enumerate(drawn.targets):
                 start = mixed.states.layout.slot[observer, j]
-                believed = dict(zip(fleet.models[j].states, estimates[start:], strict=False))
-                assert beliefs.positions(estimates)[number].tolist() == [believed["x"], believed["y"]]
-                assert beliefs.headings(estimates)[number] == believed.get("heading", 0.0)
+                estimated = dict(zip(fleet.models[j].states, estimates[start:], strict=False))
+                assert drawn.positions(estimates)[number].tolist() == [estimated["x"], estimated["y"]]
+                assert drawn.headings(estimates)[number] == estimated.get("heading", 0.0)
                 expected = [float(bounds[j][c](2.0)) for c in (0, 1)]
-                assert beliefs.half_widths(2.0)[number] == pytest.approx(expected, rel=1e-12)
-                assert beliefs.final_half_widths()[number].tolist() == [bounds[j][c].final for c in (0, 1)]
+                assert drawn.half_widths(2.0)[number] == pytest.approx(expected, rel=1e-12)
+                assert drawn.final_half_widths()[number].tolist() == [bounds[j][c].final for c in (0, 1)]
 
     def test_no_such_agent(self):
         with pytest.raises(ValueError, match="no agent 7"):
@@ -243,7 +243,7 @@ class TestAsAnObject:
         monkeypatch.setitem(sys.modules, "pygame", None)
         drawn = renderer()
         for draw in (drawn.frame, drawn.show):
-            with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
+            with pytest.raises(ModuleNotFoundError, match=r"pip install -c constraints.txt -e '\.\[render\]'"):
                 draw(*scene())
 
     @pytest.mark.parametrize("again", [False, True])

@@ -217,7 +217,7 @@ def test_bad_actions_are_refused_and_change_nothing(bad):
     if bad == "nan":
         wrong[9, 1] = np.nan
     wrong = {"nan": wrong, "shape": wrong[:-1], "transposed": wrong.T, "text": wrong.astype(str)}[bad]
-    message = r"'drifter_1' in copy 1 isn't finite: entry 1 is nan" if bad == "nan" else "actions must "
+    message = r"'drifter_1' in environment 1 isn't finite: entry 1 is nan" if bad == "nan" else "actions must "
     for actions in actions_for(env, 3):
         with pytest.raises(ValueError, match=message):
             env.step(wrong)

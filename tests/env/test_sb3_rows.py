@@ -141,7 +141,9 @@ def test_options_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"options are a dictionary, as {'initial_state': ...}; got 3 \(int\)"):
         env.set_options([3] * 16)
     env.set_options([{"initial_state": {"drifter_0": [0.1 * row, 0.0]}} for row in range(16)])
-    with pytest.raises(ValueError, match="row 1 and a row before it are agents of copy 0, and give the same states"):
+    with pytest.raises(
+        ValueError, match="row 1 and a row before it are agents of environment 0, and give the same states"
+    ):
         env.reset()
     env.set_options([{"initial_state": np.zeros((3, n))}] * 16)
     with pytest.raises(ValueError, match=r"or an array of shape \(16,\) or \(2, 16\); got \(3, 16\) for row 0"):

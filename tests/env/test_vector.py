@@ -191,8 +191,8 @@ def bad_actions(env):
     nan, infinite = good.copy(), good.astype(float)
     nan[10, 1], infinite[17, 0] = np.nan, -np.inf
     return [
-        (nan, r"the action of 'drifter_2' in copy 1 isn't finite: entry 1 is nan"),
-        (infinite, r"the action of 'drifter_1' in copy 2 isn't finite: entry 0 is -inf"),
+        (nan, r"the action of 'drifter_2' in environment 1 isn't finite: entry 1 is nan"),
+        (infinite, r"the action of 'drifter_1' in environment 2 isn't finite: entry 0 is -inf"),
         (good[:-1], r"actions must have shape \(24, 2\); got \(23, 2\)"),
         (good.reshape(3, 8, 2), r"actions must have shape \(24, 2\); got \(3, 8, 2\)"),
         (good.T, r"actions must have shape \(24, 2\); got \(2, 24\)"),
@@ -220,7 +220,7 @@ def test_bad_resets_are_refused_and_change_nothing():
     assert same(env.reset(seed=1), clean.reset(seed=1))
     n = env.batched.fleet.n
     for arguments, message in (
-        ({"seed": [1, 2]}, "expected one seed or 3, one per copy that is reset; got 2"),
+        ({"seed": [1, 2]}, "expected one seed or 3, one per environment that is reset; got 2"),
         ({"seed": [1, 2, -3]}, "a seed must be a non-negative integer, or None; got -3"),
         ({"seed": -1}, "a seed must be a non-negative integer, or None; got -1"),
         ({"options": {"initial_state": np.zeros((2, n))}}, rf"x0 must be finite, of shape \({n},\) or \(3, {n}\)"),
@@ -237,9 +237,9 @@ def test_bad_resets_are_refused_and_change_nothing():
 @pytest.mark.parametrize(
     ("copies", "message"),
     [
-        ([0, 3], r"must be different ones among 0 to 2; got \[0, 3\]"),
-        ([-1], r"among 0 to 2; got \[-1\]"),
-        ([1, 1], r"different ones .* got \[1, 1\]"),
+        ([0, 3], r"must be different indices from 0 to 2; got \[0, 3\]"),
+        ([-1], r"from 0 to 2; got \[-1\]"),
+        ([1, 1], r"different indices .* got \[1, 1\]"),
         (np.array([True, False, True]), r"not a mask: give np.flatnonzero\(mask\)"),
     ],
 )
@@ -260,7 +260,9 @@ def test_ragged_observations_have_no_rows():
 @pytest.mark.parametrize("mode", ["same_step", "next_step", "disabled"])
 def test_a_step_before_the_first_reset_is_refused(mode):
     env = vector(autoreset_mode=mode)
-    with pytest.raises(ValueError, match=r"no episode is running in 3 of 3 copies, the first 0: call reset\(\) first"):
+    with pytest.raises(
+        ValueError, match=r"no episode is running in 3 of 3 environments, the first 0: call reset\(\) first"
+    ):
         env.step(np.zeros(env.action_space.shape))
 
 

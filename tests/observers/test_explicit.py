@@ -35,7 +35,7 @@ def step_until_it_leaves(simulator: Simulator, dt: float) -> re.Match:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_too_long_a_step_leaves_the_funnel_and_says_where(seed):
-    """numerics, section 1: Euler needs dt < rho^2 / (2 lambda_max) at best. At 1e-3 s the paper's experiment fails.
+    """Euler needs dt < rho^2 / (2 lambda_max) at best (linearised at e = 0). At 1e-3 s the paper's experiment fails.
 
     The error names observer, component, time, |e| and a step; the state is the last one inside, and finite.
     """

@@ -12,14 +12,14 @@ from khop_env.observers import Exponential, ObserverDesign, Proximal
 from khop_env.physics import DoubleIntegrator, Fleet, SingleIntegrator, SurfaceVessel
 from khop_env.registry import scenario, scenarios
 from khop_env.simulation import InitialSet, Simulator
-from khop_env.simulation.simulator import parts_of_step
+from khop_env.simulation.plant import parts_of_step
 
 STEPS = st.floats(np.log(1e-4), 0.0).map(lambda exponent: float(np.exp(exponent)))
 """Any step from 1e-4 s to 1 s, as likely in each decade."""
 
 
 def has_vessels(system: System) -> bool:
-    """Whether the fleet has agents whose drift grows with the square of a state."""
+    """True if the fleet has agents whose drift grows with the square of a state."""
     return any(isinstance(model, SurfaceVessel) for model in system.design.fleet.models)
 
 
@@ -36,7 +36,7 @@ def assert_inside(simulator: Simulator) -> None:
 @settings(max_examples=150)
 @given(system=systems(), dt=STEPS, decades=st.floats(-1.0, 3.0), vary=st.booleans(), batch=st.integers(1, 3))
 def test_funnels_are_kept_for_any_step_and_any_jump_of_input_and_state(order, system, dt, decades, vary, batch):
-    """numerics, section 2: |xi+| < rho(t+) for every tau > 0, every predictor and every jump of x_i, u_i or rho.
+    """|xi+| < rho(t+) for every tau > 0, every predictor and every jump of x_i, u_i or rho.
 
     Random graphs, relay or not, fleets, funnels, observers with and without f and g_hat, and disturbances. Before each
     step every state and every input jumps to somewhere else, up to a thousand metres away; the step may change too.
@@ -112,7 +112,7 @@ class TestStepsThatTheDriftCannotTake:
         for name in ("t", "x", "estimates", "input_estimates"):
             assert np.array_equal(getattr(whole, name), getattr(parts, name)), name
 
-    def test_do_not_make_states_explode(self):
+    def test_do_not_make_states_diverge(self):
         simulator = self.simulator()
         for _ in range(30):
             simulator.step(1.0)

@@ -66,7 +66,7 @@ def test_lemma_2_the_norm_of_funnels_is_a_funnel(functions, seed):
 
 @given(functions=st.lists(exponentials(), min_size=1, max_size=6))
 def test_one_exponential_below_several(functions):
-    """numerics, section 9: smallest coefficients and fastest rate make a C^1 lower bound of all bounds."""
+    """Smallest coefficients and fastest rate make a C^1 lower bound of all bounds, as Problem 2 needs."""
     lowest = lower_bound(functions)
     for function in functions:
         assert np.all(lowest(TIMES) <= function(TIMES) * (1 + 1e-14))
@@ -105,5 +105,5 @@ def test_a_user_s_function_that_breaks_definition_1_is_named(bad):
 
     bank = FunnelBank([Exponential(1.0, 1.0, 1.0), Broken()])
     bank.evaluate(np.array([0.5, 1.0]), np.empty((2, 2)))
-    with pytest.raises(ValueError, match=r"Broken\(\) gave .* Definition 1 wants positive, bounded values"):
+    with pytest.raises(ValueError, match=r"Broken\(\) gave .* Definition 1 requires positive, bounded values"):
         bank.evaluate(np.array([0.5, 1.5]), np.empty((2, 2)))

@@ -1,4 +1,4 @@
-"""The proximal solve (numerics, section 2): one solution, inside the funnel, found from anywhere, lane by lane."""
+"""The proximal solve: one solution, inside the funnel, found from any start, lane by lane."""
 
 import networkx as nx
 import numpy as np
@@ -49,7 +49,7 @@ def problem(layout, rng, batch=1, hard=True):
 
 
 def full_matrix(layout):
-    """M of all targets and components at once, and how much of the truth each estimate is told."""
+    """M of all targets and components at once, and the weight of the true state in each disagreement."""
     m, h = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     for index, block in enumerate(layout.blocks):
         part, n = block.columns, block.components
@@ -80,7 +80,7 @@ def check_solution(layout, tau, predictor, source, rho, estimate, eps, slope):
 @settings(max_examples=200)
 @given(graph=connected_graphs(smallest=2, largest=13), about=hops(), seed=SEEDS)
 def test_stress_one_component_converges_from_anywhere(graph, about, seed):
-    """numerics, section 2: a solution for every tau > 0, every predictor and every jump, and Newton finds it.
+    """A solution for every tau > 0, every predictor and every jump, and Newton finds it.
 
     Over 33 000 random targets with eta up to 12, rho in 1e-4..1e2, tau in 1e-6..10 and predictors and states up to 1e6
     away, 26 iterations were the most from eps = 0 (median 4).
@@ -105,7 +105,7 @@ def test_stress_one_component_converges_from_anywhere(graph, about, seed):
     graph=connected_graphs(), about=hops(), dimensions=st.lists(st.integers(1, 6), min_size=9, max_size=9), seed=SEEDS
 )
 def test_moderate_jumps_end_strictly_inside(graph, about, dimensions, seed):
-    """The open funnel |xi+| < rho holds for xi recomputed from the estimates, wherever rounding can tell; any n_i."""
+    """The open funnel |xi+| < rho holds for xi recomputed from the estimates, up to rounding; any n_i."""
     layout = layout_of(graph, *about, dimensions[: len(graph)])
     tau, predictor, source, rho = problem(layout, np.random.default_rng(seed), batch=3, hard=False)
     estimate, eps, slope, (_, env, _) = run(layout, tau, predictor, source, rho)

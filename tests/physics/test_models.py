@@ -227,7 +227,7 @@ def test_library_parameters_are_checked() -> None:
 
 
 class TestExplicitStep:
-    """What a drift says of the longest explicit step, which simulators divide longer ones by."""
+    """The longest explicit step that a drift declares; simulators divide longer steps."""
 
     def test_slow_and_bounded_drifts_take_any(self) -> None:
         for model in (SingleIntegrator(), DriftingIntegrator(), Unicycle(), DoubleIntegrator(damping=0.0)):
@@ -255,7 +255,7 @@ class TestExplicitStep:
         assert chosen.fleet.explicit_step(chosen.initial.radius, bound) == (pytest.approx(0.0555, abs=1e-4), 9)
 
     @pytest.mark.parametrize("order", [1, 2])
-    def test_a_vessel_does_not_explode_in_steps_of_its_own(self, order: int) -> None:
+    def test_a_vessel_does_not_diverge_in_steps_of_its_own(self, order: int) -> None:
         """With inputs at their limits that flip, stay, or push along the motion, which raises the energy most."""
         rng = np.random.default_rng(0)
         for vessel in (SurfaceVessel(), SurfaceVessel(input_limit=(30.0, 40.0, 5.0))):

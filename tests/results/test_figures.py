@@ -38,10 +38,14 @@ def test_the_file_shows_three_panels_in_colour(tmp_path):
         assert (np.ptp(third, axis=2) > 0.3).sum() > 500  # in colour
 
 
-def test_agent_4_of_the_paper_is_shown(tmp_path, monkeypatch):
-    scenario = paper()
+@pytest.mark.parametrize(
+    ("changes", "agent"), [({}, 3), ({"name": "renamed"}, 3), ({"figure_agent": 5}, 5), ({"figure_agent": None}, 3)]
+)
+def test_the_agent_that_the_scenario_names_is_shown(changes, agent, tmp_path, monkeypatch):
+    """In `paper` agent 4 of the paper, whatever the scenario's name; without a name the agent with most observers."""
+    scenario = paper().replace(**changes)
     found = texts(recorded(scenario), scenario, tmp_path, monkeypatch)
-    assert sum("drifter_3" in text for text in found) == 2
+    assert sum(f"drifter_{agent}" in text for text in found) == 2
     assert "time (s)" in found
     assert "first coordinate (m)" in found
     assert any(text.endswith("(m/s)") for text in found)
@@ -88,7 +92,7 @@ def test_an_unknown_agent_is_refused(tmp_path):
 
 
 def legend_of(rows: list[tuple[str, str]], tmp_path, monkeypatch) -> list[str]:
-    """The legend's entries for rows of a table of policies and observation modes."""
+    """Legend entries for rows of policies and observation modes."""
     from matplotlib.figure import Figure
 
     kept = []

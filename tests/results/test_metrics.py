@@ -64,7 +64,7 @@ def test_consensus_error_against_the_projection_matrix():
 
 
 def test_numbers_that_are_not_finite_are_null():
-    """And nothing is said to be kept then, whatever the ratios are."""
+    """`funnel_kept` is False then, whatever the ratios are."""
     recording, _ = summary(paper(), duration=0.1)
     x = recording.x.copy()
     x[-1, 0] = np.nan

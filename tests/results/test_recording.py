@@ -37,8 +37,8 @@ def test_samples_are_the_simulators_own_values(recording):
     assert vars_equal(recording.extremes, sim.extremes)
 
 
-def vars_equal(one, other) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+def vars_equal(first, second) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -90,10 +90,10 @@ def test_the_guarantee_in_the_samples(recording):
 
 
 def test_progress_is_told_and_ends_at_one():
-    told: list[float] = []
-    record(simulator(paper()), 0.1, 0.01, progress=told.append)
-    assert told[-1] == 1.0
-    assert told == sorted(told)
+    fractions: list[float] = []
+    record(simulator(paper()), 0.1, 0.01, progress=fractions.append)
+    assert fractions[-1] == 1.0
+    assert fractions == sorted(fractions)
 
 
 def test_leaving_the_funnel_loses_nothing():

@@ -41,7 +41,7 @@ def path_of(agents: int = 4, **changes) -> Scenario:
 
 
 def assumption(report, number: str):
-    (found,) = [one for one in report["assumptions"] if one["number"] == number]
+    (found,) = [entry for entry in report["assumptions"] if entry["number"] == number]
     return found
 
 
@@ -50,8 +50,8 @@ def test_every_scenario_is_feasible_and_plain_json(make):
     report = design_report(make())
     assert report["feasible"] is True
     assert json.loads(json.dumps(report, allow_nan=False)) == report
-    assert [one["number"] for one in report["assumptions"]] == ["1-i", "1-ii", "1-iii", "2", "3", "4", "5", "6"]
-    assert all(one["why"] for one in report["assumptions"])
+    assert [entry["number"] for entry in report["assumptions"]] == ["1-i", "1-ii", "1-iii", "2", "3", "4", "5", "6"]
+    assert all(entry["why"] for entry in report["assumptions"])
 
 
 def test_agent_4_of_the_paper():
@@ -102,7 +102,7 @@ def test_a_design_that_is_impossible_is_reported_not_raised():
 
 
 def test_unbounded_inputs_can_only_be_checked_at_the_start():
-    """As a simulator does (Assumption 2-ii): the report says null, not infeasible."""
+    """As in a simulator (Assumption 2-ii): the report has null, and is feasible."""
     scenario = path_of(models=(SingleIntegrator(input_limit=np.inf),) * 4)
     report = design_report(scenario)
     scenario.build()
@@ -123,7 +123,7 @@ def test_the_keys_are_the_same_whatever_is_wrong():
 
 
 class Own:
-    """max(floor, 10 exp(-t)), with what it says of its infimum."""
+    """max(floor, 10 exp(-t)), with a declared infimum."""
 
     def __init__(self, floor: float, said: float) -> None:
         self.floor, self.said = floor, said
@@ -187,8 +187,8 @@ def with_final(bounds, final: float):
     if isinstance(bounds, Exponential):
         return Exponential(bounds.initial, final, bounds.rate)
     if isinstance(bounds, dict):
-        return {kind: with_final(one, final) for kind, one in bounds.items()}
-    return [with_final(one, final) for one in bounds]
+        return {kind: with_final(bound, final) for kind, bound in bounds.items()}
+    return [with_final(bound, final) for bound in bounds]
 
 
 def test_a_step_that_the_plants_drift_cannot_take_is_refused_before_the_start():
@@ -215,7 +215,7 @@ def test_a_task_graph_that_falls_apart_is_worth_a_warning():
 
 
 class Drizzle(Term):
-    """A disturbance of a user's own."""
+    """A user's own disturbance."""
 
     def add(self, t, x, drawn, channels, out):
         out[:, channels.index] += channels.amplitude
@@ -253,7 +253,7 @@ class TestAssumptions:
         assert assumption(design_report(paper().replace(disturbance=None)), "5")["status"] == "not known"
 
     def test_integrators_descend_what_is_said_to_decrease_at_their_limits_too(self):
-        """Where leaves of a star hardly move, its centre, above the mean, goes on up: |Pi x|^2 rises, and V falls."""
+        """In a star with slow leaves the centre, above the mean, keeps rising: |Pi x|^2 grows while V decreases."""
         star = nx.star_graph(4)
         scenario = path_of(
             5,
@@ -280,11 +280,11 @@ class TestAssumptions:
         assert (np.diff(sums, axis=0) <= 1e-12).all()
 
     def test_a_disturbance_that_vanishes_at_agreement_says_nothing_against_it(self):
-        """Nor does one of states that positions don't follow; so nothing is claimed."""
+        """Nor does a disturbance of states that don't drive positions, so nothing is claimed."""
         for disturbance in (Coupling(0.5), Drizzle(0.2)):
             found = assumption(design_report(path_of(disturbance=disturbance)), "5")
             assert found["status"] == "not known"
-            assert "vanishes as agents meet, or is your own" in found["why"]
+            assert "vanishes in agreement, or is your own" in found["why"]
         heading = Sinusoid((0.0, 0.0, 0.3))
         bound = Exponential(10.0, 0.1, 5.0)
         found = assumption(
@@ -295,7 +295,7 @@ class TestAssumptions:
         assert assumption(design_report(path_of(disturbance=Sum())), "1-iii")["why"] == "w = 0"
 
     def test_the_gain_that_would_do_near_agreement_is_told(self):
-        """lambda_2 of the paper's task graph, with the law's own gain and where a file leaves it out."""
+        """lambda_2 of the paper's task graph, with the law's gain and without a gain in the file."""
         calm = paper().replace(disturbance=None)
         enough = 1.0 / nx.algebraic_connectivity(calm.task)
         assert f"= {enough:.4g} 1/s (here k_c = 2)" in assumption(design_report(calm), "5")["why"]

@@ -34,7 +34,7 @@ def test_estimates_columns(table, recording):
 
 
 def test_each_estimate_stands_beside_its_own_truth(table, recording):
-    """Every row is found again through the layout's slots and the fleet's names, not through the table's order."""
+    """Every row agrees with the layout's slots and the fleet's names, independent of the table's order."""
     design, fleet = recording.design, recording.fleet
     rng = np.random.default_rng(0)
     for quantity, kind, funnels in (
@@ -64,7 +64,7 @@ def test_the_guarantee_can_be_read_off_the_table(table):
 
 
 def test_disagreement_is_the_papers_neighbour_sum(table, recording):
-    """xi = sum over neighbours in the k-hop set of (own - theirs) + h (own - truth), from the table's estimates."""
+    """xi = sum over neighbours in the k-hop set of (own - other) + h (own - truth), from the table's estimates."""
     design, fleet = recording.design, recording.fleet
     last = table.filter(pl.col("quantity") == "state", pl.col("time") == pl.col("time").max())
     target = fleet.ids[int(design.states.layout.target[0])]

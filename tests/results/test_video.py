@@ -1,4 +1,4 @@
-"""Films can be read back: as long as the run, of the promised size, and with something happening in them."""
+"""Films can be read back: they have the length of the run, the documented size, and changing frames."""
 
 import importlib.util
 import subprocess
@@ -76,12 +76,12 @@ def test_the_gauge_shows_both_kinds_of_observers_at_that_time(run, tmp_path, mon
     from khop_env.env import rendering
 
     recording, scenario = run
-    shown = []
+    frames = []
     draw = rendering.Renderer.frame
-    monkeypatch.setattr(rendering.Renderer, "frame", lambda self, *scene: (shown.append(scene), draw(self, *scene))[1])
+    monkeypatch.setattr(rendering.Renderer, "frame", lambda self, *scene: (frames.append(scene), draw(self, *scene))[1])
     write_video(recording, scenario, tmp_path / "film.mp4")
-    assert len(shown) == 10
-    for (t, _, _, ratio, *_), k in zip(shown, video._samples(recording, 25.0), strict=True):
+    assert len(frames) == 10
+    for (t, _, _, ratio, *_), k in zip(frames, video._samples(recording, 25.0), strict=True):
         kinds = recording.states, recording.inputs
         assert t == recording.time[k]
         assert ratio == max((np.abs(kind.disagreement[k]) / kind.rho[k]).max() for kind in kinds)
@@ -99,20 +99,20 @@ def test_the_observer_is_chosen(tmp_path, monkeypatch):
     recording = recorded(scenario, 0.04)
     for observer in ("vessel_1", 10):
         write_video(recording, scenario, tmp_path / "film.gif", observer=observer)
-    assert [one.observer for one in chosen] == [10, 10]
+    assert [renderer.observer for renderer in chosen] == [10, 10]
     with pytest.raises(ValueError, match="did you mean 'vessel_1'"):
         write_video(recording, scenario, tmp_path / "film.gif", observer="vesel_1")
 
 
 def test_refusals(run, tmp_path, monkeypatch):
     for name in ("film.avi", "film", "mp4"):
-        with pytest.raises(ValueError, match=r"ends in \.mp4 or \.gif"):
+        with pytest.raises(ValueError, match=r"must end in \.mp4 or \.gif"):
             require_video(tmp_path / name)
     for options in ({"fps": 0}, {"fps": 100}, {"speed": 0.0}, {"speed": float("nan")}):
         with pytest.raises(ValueError, match="expected fps"):
             write_video(*run, tmp_path / "film.gif", **options)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'khop_env\[render\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install -c constraints.txt -e '\.\[render\]'"):
         require_video("film.mp4")
 
 
@@ -145,7 +145,7 @@ def test_a_run_that_went_wrong_is_filmed(run, tmp_path):
 
 
 def test_progress_is_told(run, tmp_path):
-    told = []
-    write_video(*run, tmp_path / "film.gif", progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    fractions = []
+    write_video(*run, tmp_path / "film.gif", progress=fractions.append)
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0

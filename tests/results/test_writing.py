@@ -1,4 +1,4 @@
-"""The files of a run: each is written whatever happens to the others."""
+"""The files of a run: each is written even if others fail."""
 
 import json
 from dataclasses import replace
@@ -45,7 +45,7 @@ def test_one_file_that_fails_leaves_the_others(tmp_path, monkeypatch):
         write_run(recording, scenario, {"seed": 2}, tmp_path)
     assert set(caught.value.written) == {"states", "estimates", "summary"}
     assert json.loads((tmp_path / "summary.json").read_text()) == {"seed": 2}
-    assert not (tmp_path / "figure.png").exists()  # the one of the run before would be taken for this one's
+    assert not (tmp_path / "figure.png").exists()  # a figure of the earlier run could be mistaken for this run's
 
     monkeypatch.setattr(writing, "states_table", broken)
     with pytest.raises(RunFileError, match=r"states\.parquet.*summary\.json.*figure\.png"):

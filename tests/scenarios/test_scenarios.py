@@ -41,8 +41,8 @@ def test_paper_has_the_published_numbers():
 
 def test_papers_task_mostly_joins_agents_out_of_earshot():
     scenario = paper()
-    unheard = [edge for edge in scenario.task.edges if not scenario.communication.has_edge(*edge)]
-    assert len(unheard) > len(scenario.task.edges) / 2
+    to_targets = [edge for edge in scenario.task.edges if not scenario.communication.has_edge(*edge)]
+    assert len(to_targets) > len(scenario.task.edges) / 2
     assert nx.is_connected(scenario.task)
 
 
@@ -167,7 +167,10 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"task": nx.Graph([(0, 7), *((i, i + 1) for i in range(7))])}, r"nobody could act.*\(0, 7\) at distance 5"),
+        (
+            {"task": nx.Graph([(0, 7), *((i, i + 1) for i in range(7))])},
+            r"know nothing of each other.*\(0, 7\) at distance 5",
+        ),
         ({"radius": np.ones(5)}, "radius must be one finite number or 16"),
         ({"radius": -1.0}, "radius must not be negative"),
         ({"dt": 0.0}, "dt must be positive"),
@@ -182,7 +185,9 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
             "the drift of its observers must be True or False; got 'no'",
         ),
         ({"order": 3}, "order must be 1 or 2; got 3"),
-        ({"name": "../../x"}, "name names a folder, too: 1 to 200 characters without '/'; got '../../x'"),
+        ({"figure_agent": 8}, "figure_agent must be None or an agent's index from 0 to 7; got 8"),
+        ({"figure_agent": True}, "figure_agent must be None or an agent's index from 0 to 7; got True"),
+        ({"name": "../../x"}, "name is also a folder's: 1 to 200 characters without '/'; got '../../x'"),
         ({"name": ""}, "1 to 200 characters"),
         ({"name": "n" * 201}, "1 to 200 characters"),
         ({"name": "a\x1b[31mb"}, r"name must not have control characters; got 'a\\x1b\[31mb'"),

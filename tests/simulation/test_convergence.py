@@ -41,7 +41,7 @@ def reference():
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_order_of_convergence(order, reference):
-    """ARS(1,1,1) and ARS(2,2,2) (numerics, section 3) converge with their order, in states, estimates and input
+    """ARS(1,1,1) and ARS(2,2,2) (Ascher et al., 1997) converge with their order, in states, estimates and input
     estimates.
 
     The largest error over ten instants of the first second, the paper's closed loop with disturbances, dt 1e-3 to

@@ -40,7 +40,7 @@ class Probe:
 
 @settings(max_examples=60)
 @given(system=systems(largest=7))
-def test_an_observer_hears_its_neighbors_only(system):
+def test_an_observer_uses_messages_of_its_neighbors_only(system):
     """A change of all that an agent outside N_a and a knows, its state, its effect g and its estimates, changes no bit
     of a's right-hand side, unless it is the target itself, whose state (and g) a neighbour relays where h_a > 0.
     """
@@ -49,26 +49,26 @@ def test_an_observer_hears_its_neighbors_only(system):
     rng = np.random.default_rng(system.seed)
     for j in graph:
         own = system.design.fleet.state_slice(j)
-        beliefs, everything = probe.state.copy(), probe.state.copy()
-        for state in (beliefs, everything):
+        estimated, everything = probe.state.copy(), probe.state.copy()
+        for state in (estimated, everything):
             for kind, observer, _, columns in probe.pairs():
                 if observer == j:
                     estimates = state.memory["input_estimate" if kind else "estimate"]
                     estimates[columns] += rng.normal(size=estimates[columns].shape)
         everything.x[own] += rng.normal(size=everything.x[own].shape)
         everything.g[own] += rng.normal(size=everything.g[own].shape)
-        after_beliefs, after_everything = probe.derivative(beliefs), probe.derivative(everything)
+        after_estimated, after_everything = probe.derivative(estimated), probe.derivative(everything)
         for kind, a, i, columns in probe.pairs():
             if j == a or graph.has_edge(a, j):
                 continue
-            np.testing.assert_array_equal(after_beliefs[kind][columns], before[kind][columns])
+            np.testing.assert_array_equal(after_estimated[kind][columns], before[kind][columns])
             if j != i or relays(graph, a, i, system.design.relay) == 0:
                 np.testing.assert_array_equal(after_everything[kind][columns], before[kind][columns])
 
 
 @settings(max_examples=60)
 @given(system=systems(largest=7))
-def test_an_observer_does_hear_its_neighbors(system):
+def test_an_observer_does_use_messages_of_its_neighbors(system):
     """The control of the test above: the estimates of a's neighbours in N_i^{k-hop}, and x_i where it is relayed, do
     matter.
 
@@ -105,8 +105,8 @@ def test_an_observer_does_hear_its_neighbors(system):
 @settings(max_examples=60)
 @given(system=systems(largest=7))
 def test_a_law_acts_on_what_its_agent_knows(system):
-    """u_i = psi_i(x_bar_i, x_hat^i) (Section V): a change of the state of an agent out of i's earshot changes no bit
-    of u_i, nor does a change of the estimates of such an agent.
+    """u_i = psi_i(x_bar_i, x_hat^i) (Section V): a change of the state of an agent that isn't i's neighbour changes
+    no bit of u_i, nor does a change of the estimates of such an agent.
     """
     simulator = system.simulator(Proximal(), law=TanhConsensus(1.0))
     simulator.step(0.02)

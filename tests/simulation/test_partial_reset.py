@@ -126,12 +126,12 @@ def test_initial_states_and_generators_for_the_chosen():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"env_ids": [0, 5]}, ValueError, r"env_ids must be different ones among 0 to 4; got \[0, 5\]"),
-        ({"env_ids": [-1]}, ValueError, r"among 0 to 4; got \[-1\]"),
-        ({"env_ids": [1, 1]}, ValueError, r"different ones among 0 to 4; got \[1, 1\]"),
-        ({"env_ids": [[0, 1]]}, ValueError, r"among 0 to 4; got \[\[0, 1\]\]"),
-        ({"env_ids": 2}, ValueError, r"among 0 to 4; got 2"),
-        ({"env_ids": [0.5]}, ValueError, r"among 0 to 4; got \[0.5\]"),
+        ({"env_ids": [0, 5]}, ValueError, r"env_ids must be different indices from 0 to 4; got \[0, 5\]"),
+        ({"env_ids": [-1]}, ValueError, r"from 0 to 4; got \[-1\]"),
+        ({"env_ids": [1, 1]}, ValueError, r"different indices from 0 to 4; got \[1, 1\]"),
+        ({"env_ids": [[0, 1]]}, ValueError, r"from 0 to 4; got \[\[0, 1\]\]"),
+        ({"env_ids": 2}, ValueError, r"from 0 to 4; got 2"),
+        ({"env_ids": [0.5]}, ValueError, r"from 0 to 4; got \[0.5\]"),
         ({"env_ids": np.eye(5, dtype=bool)[1]}, ValueError, r"not a mask: give np.flatnonzero\(mask\)"),
         ({"env_ids": [0, 1], "seed": [1]}, ValueError, "expected one seed or 2, one per environment; got 1"),
         ({"env_ids": [0, 1], "seed": [1, -2]}, ValueError, "non-negative"),

@@ -1,4 +1,4 @@
-"""What the simulator refuses, and that a refusal leaves its state as it was."""
+"""Errors of the simulator; after each its state is unchanged."""
 
 import networkx as nx
 import numpy as np

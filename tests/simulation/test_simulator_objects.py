@@ -60,7 +60,7 @@ class Failing(SingleIntegrator):
 @pytest.mark.parametrize("integrator", [Proximal(1), Proximal(2), Explicit()])
 @pytest.mark.parametrize("graph", [nx.star_graph(3), nx.complete_graph(4)])
 def test_a_state_that_nobody_estimates_may_not_become_nan_unseen(integrator, graph):
-    """Numerics, section 2: non-finite states are an error; here the hub's, whom all others hear."""
+    """Non-finite states are an error; here those of the hub, the neighbour of all others."""
     scenario = Scenario(
         name="hub",
         description="the hub fails",

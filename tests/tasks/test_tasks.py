@@ -1,4 +1,4 @@
-"""What agents are asked to do, who leads, and that rewards are the documented formula of the true states."""
+"""Tasks: displacements, leaders, and rewards, which are the documented formula of the true states."""
 
 import math
 
@@ -263,7 +263,7 @@ def test_leaders_that_cannot_be_are_refused(arguments, message):
 
 
 def test_leaders_and_followers_are_the_users_to_choose():
-    """By id, by number, and who follows whom, even within earshot; spacing=0 is to meet the leader."""
+    """By id, by number, and the leader of each follower, even a neighbour; spacing=0 is to meet the leader."""
     env = parallel(
         "leader_following_v0", "convoy", leaders=["drifter_3"], follow={"drifter_2": "drifter_3"}, spacing=0.0
     )

@@ -28,7 +28,7 @@ class Camera:
 
     Args:
         rect: left, top, width and height of the rectangle in pixels.
-        margin: pixels along its edges that what is followed keeps out of.
+        margin: pixels along its edges that followed points stay out of.
     """
 
     def __init__(self, rect: tuple[float, float, float, float], margin: float) -> None:
@@ -72,7 +72,7 @@ class Camera:
 
 
 class Labels:
-    """Finds places for short texts beside their markers, where they cover neither markers nor each other."""
+    """Places short texts beside their markers so that they cover neither markers nor each other."""
 
     def __init__(self) -> None:
         self._last: dict[int, int] = {}
@@ -85,7 +85,7 @@ class Labels:
         taken: FloatArray,
         within: tuple[float, float, float, float],
     ) -> dict[int, tuple[FloatArray, bool]]:
-        """Where each label goes; those that find no room are left out.
+        """Positions of the labels; labels without room are left out.
 
         A label stays on the side where it was in the frame before, if it can.
 
@@ -93,11 +93,11 @@ class Labels:
             anchors: (L, 2) middles of the markers in pixels.
             sizes: (L, 2) widths and heights of the texts.
             radii: (L,) of the markers in pixels.
-            taken: (M, 4) left, top, right, bottom of what must not be covered.
-            within: left, top, width, height of where labels may be.
+            taken: (M, 4) left, top, right, bottom of rectangles that must stay visible.
+            within: left, top, width, height of the area for labels.
 
         Returns:
-            By label its middle, and whether it is so far from its marker that a line should join them.
+            By label its centre, and True if it is so far from its marker that a line should join them.
         """
         left, top, width, height = within
         found = {}
@@ -117,6 +117,6 @@ class Labels:
 
 
 def _overlap(low: FloatArray, high: FloatArray, taken: FloatArray) -> NDArray[np.bool_]:
-    """(C,) whether each of C rectangles meets any of M taken ones."""
+    """(C,) True for each of C rectangles that overlaps any of the M taken ones."""
     apart = (high[:, None, :] <= taken[None, :, :2]) | (low[:, None, :] >= taken[None, :, 2:])
     return np.any(~np.any(apart, axis=-1), axis=-1)

@@ -1,4 +1,4 @@
-"""Lines, markers and texts on a picture: all that is asked of pygame, which is imported when it is needed."""
+"""Lines, markers and texts on a picture: all uses of pygame, which is imported on demand."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.env.rendering.scene import INK
+from khop_env.extras import how_to_install
 from khop_env.observers import FloatArray
 
 Rect = tuple[float, float, float, float]
@@ -21,7 +22,7 @@ Rect = tuple[float, float, float, float]
 
 FRAMES_PER_SECOND = 25  # of a window, at most
 
-_FINE = 2  # drawn at so many times the size and scaled down, which smooths all edges
+_FINE = 2  # render at 2x and downscale (anti-aliasing)
 
 
 @functools.cache
@@ -29,13 +30,13 @@ def load_pygame() -> ModuleType:
     """The module, without its greeting on stdout.
 
     Raises:
-        ModuleNotFoundError: saying what to install.
+        ModuleNotFoundError: without pygame-ce; the message says how to install it.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
         import pygame
     except ModuleNotFoundError:
-        raise ModuleNotFoundError("rendering needs pygame-ce: pip install 'khop_env[render]'") from None
+        raise ModuleNotFoundError(f"rendering needs pygame-ce: {how_to_install('render')}") from None
     return pygame
 
 
@@ -100,17 +101,17 @@ class Canvas:
         self.polygon(at + outline @ np.array([[cos, -sin], [-sin, -cos]]), color, width)
 
     def box(self, rect: Rect, color: str, tint: float = 0.1) -> None:
-        """A rectangle with a border; its inside is tinted, unless it is all that is in view."""
+        """A rectangle with a border; its inside is tinted, unless it covers the whole view."""
         left, top, width, height = (_FINE * edge for edge in rect)
         area = self._pg.Rect(
             round(left), round(top), round(left + width) - round(left), round(top + height) - round(top)
         )
-        shown = area.clip(self._large.get_clip())
-        if shown != self._large.get_clip():
-            inside = self._pg.Surface(shown.size)
+        visible = area.clip(self._large.get_clip())
+        if visible != self._large.get_clip():
+            inside = self._pg.Surface(visible.size)
             inside.fill(color)
             inside.set_alpha(round(255 * tint))
-            self._large.blit(inside, shown)
+            self._large.blit(inside, visible)
         border = round(_FINE * 1.5)  # half of it on either side of the edge; pygame draws all of it inside
         self._pg.draw.rect(self._large, color, area.inflate(border, border), border)
 
@@ -155,7 +156,7 @@ class Canvas:
 
 
 class Window:
-    """A window on the screen, one of several; without a screen SDL draws to none, and a message says so.
+    """A window on the screen; there may be several. Without a display nothing is visible, and a message says so.
 
     Args:
         size: in pixels.
@@ -178,7 +179,7 @@ class Window:
         _windows.add(self)
 
     def show(self, canvas: Canvas) -> bool:
-        """Show a picture, wait for its turn, and return whether the user wants the window to go."""
+        """Show a picture, wait to keep the frame rate, and return True if the user has closed the window."""
         try:
             surface = self._window.get_surface()
         except self._pg.error:  # others have called pygame.quit() or pygame.display.quit(), which close every window
@@ -191,7 +192,7 @@ class Window:
         return self._dismissed
 
     def close(self) -> None:
-        """Take it off the screen, and nobody else's."""
+        """Close this window only."""
         self._window.destroy()
         _windows.discard(self)
 
@@ -201,13 +202,13 @@ class Window:
             os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         pg.display.init()
         if pg.display.get_driver() in ("dummy", "offscreen"):
-            _say_once('khop_env: there is no display to show frames on; render_mode="rgb_array" gives them as arrays')
+            _say_once('khop_env: there is no display to show frames on; render_mode="rgb_array" returns them as arrays')
         self._window = pg.Window(self._title, self._size)
 
     def _read_events(self) -> None:
-        """Tell all of our windows what the user wants; there is one queue, and events of others' windows stay in it."""
+        """Pass closing events to all of our windows; there is one queue, and events of other windows stay in it."""
         pg = self._pg
-        ours_alone = pg.display.get_surface() is None  # then nobody else empties the queue
+        ours_alone = pg.display.get_surface() is None  # then no other window's owner empties the queue
         for event in pg.event.get(None if ours_alone else (pg.QUIT, pg.WINDOWCLOSE)):
             if event.type == pg.QUIT:
                 for window in _windows:

@@ -1,4 +1,4 @@
-"""The strip beside the map: time, how far the guarantee is used up, and what the symbols mean."""
+"""The strip beside the map: time, the worst ratio |e| against its guaranteed limit of 1, and the legend."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CIRCLE = np.stack([np.cos(np.arange(48) * math.pi / 24), np.sin(np.arange(48) * 
 def draw_agent(
     canvas: Canvas, look: Look, at: FloatArray, heading: float, radius: float, *, star: bool, ring: bool
 ) -> None:
-    """An agent's marker with a white rim, a star if it doesn't act, and a ring if its estimates are shown."""
+    """An agent's marker with a white rim, a star if it doesn't act, and a ring if its estimates are drawn."""
     canvas.marker(1.25 * radius * look.outline, at, heading, "white")
     canvas.marker(radius * look.outline, at, heading, look.color)
     if star:
@@ -52,15 +52,15 @@ def draw_task_edge(canvas: Canvas, ends: FloatArray, unit: float, thin: float, *
 
 
 class Panel:
-    """The strip: what stays the same in all frames, and `draw` for what doesn't.
+    """The strip: constant contents as arguments, and those that change in `draw`.
 
     Args:
         rect: where it is.
         unit: size of a pixel of the usual frame.
         types: text and look of each type of agent.
-        driven: what agents with a star are called; None if there are none.
+        driven: name in the legend of agents with a star; None if there are none.
         task: whether there are task edges.
-        observer: id and look of the agent whose beliefs are shown, if it has any.
+        observer: id and look of the agent whose estimates are drawn; None without estimates.
         error_label: name of the error beside the gauge.
         error_unit: its unit.
     """
@@ -89,7 +89,7 @@ class Panel:
             t: in s.
             normalized: largest |e|.
             task_error: if there is one.
-            hidden: how many guaranteed boxes are larger than the view.
+            hidden: number of guaranteed boxes that are larger than the view.
         """
         self._line = self._top + 12 * self._unit
         self._write(canvas, f"t = {t:.2f} s", size=20, advance=38)
@@ -154,15 +154,15 @@ class Panel:
             return
         self._line += 12 * unit
         name, own = self._observer
-        self._write(canvas, "One agent's beliefs", advance=28)
+        self._write(canvas, "One agent's estimates", advance=28)
         draw_agent(canvas, own, self._symbol(), 0.0, 0.7 * radius, star=False, ring=True)
         self._write(canvas, name, indent=34)
-        ghost, truth = ends = self._symbol() + np.array([[-7 * unit, 0], [9 * unit, 0]])
+        estimate, truth = ends = self._symbol() + np.array([[-7 * unit, 0], [9 * unit, 0]])
         canvas.line(ends, first.color, 1.0 * unit)
         canvas.marker(0.6 * radius * first.outline, truth, 0.0, first.color)
-        canvas.marker(radius * first.outline, ghost, 0.0, first.color, 1.5 * unit)
-        self._write(canvas, "where it believes", indent=34, advance=16)
-        self._write(canvas, "a target to be", indent=34, advance=28)
+        canvas.marker(radius * first.outline, estimate, 0.0, first.color, 1.5 * unit)
+        self._write(canvas, "estimated position", indent=34, advance=16)
+        self._write(canvas, "of a target", indent=34, advance=28)
         x, y = self._symbol()
         canvas.box((x - 11 * unit, y - 9 * unit, 22 * unit, 18 * unit), first.color)
         self._write(canvas, "box that holds the", indent=34, advance=16)

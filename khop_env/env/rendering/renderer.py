@@ -1,4 +1,4 @@
-"""Frames of a running fleet: who is where, who hears whom, and what one agent believes of those it can't hear."""
+"""Frames of a running fleet: positions, communication graph, task edges, and the estimates of one agent."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 
 from khop_env.env.rendering.camera import Camera, Labels
 from khop_env.env.rendering.canvas import Canvas, Window
-from khop_env.env.rendering.panel import CIRCLE, Panel, draw_agent, draw_task_edge
+from khop_env.env.rendering.on_map import OnMap
+from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import (
     EDGE_COLOR,
     PALE,
     SOFT,
     TRAIL,
-    Beliefs,
+    Estimates,
     angles,
+    default_observer,
     headings,
     looks,
     mix,
-    neediest,
     sensible,
     short_names,
     undirected,
@@ -33,34 +34,34 @@ from khop_env.tasks import MapCanvas, Task, World
 
 Decorate = Callable[[MapCanvas], None]
 
-_MOST_LABELS = 40  # in larger fleets only the agents whose estimates are shown are labelled
+_MOST_LABELS = 40  # in larger fleets only the observer and its targets are labelled
 _FADES = 8  # shades of a trail
 
 
 class Renderer:
     """Draws the state of a fleet as pictures, or in a window.
 
-    Agents by type, communication edges solid and task edges dashed; for one agent its beliefs: ghosts where it
-    estimates its targets, each in the box that the observers guarantee to hold the target. Fleets in space are seen
-    from above, fleets on a line have a row for each agent.
+    Agents by type, communication edges solid and task edges dashed; for one agent its estimates: hollow markers at
+    the estimated positions of its targets, each in the box that is guaranteed to hold the target. Fleets in space are
+    seen from above, fleets on a line have a row for each agent.
 
     Args:
-        design: the observers, which know the fleet and the communication graph.
+        design: the observers, with the fleet and the communication graph.
         task_edges: (E, 2) directed pairs (i, j): agent i acts on j.
         driven: indices of the agents that don't act, marked with a star.
-        driven_label: what the legend calls them.
-        observer: index of the agent whose beliefs are shown; by default the one with most task edges to agents that it
-            can't hear.
-        title: shown above the picture.
+        driven_label: their name in the legend.
+        observer: index of the agent whose estimates are drawn; by default the agent with most task edges to k-hop
+            targets.
+        title: text above the picture.
         error_label: name of the error beside the map.
         error_unit: its unit; by default that of positions.
         size: width and height in pixels.
 
     Attributes:
-        observer: index of the agent whose beliefs are shown.
+        observer: index of the agent whose estimates are drawn.
 
     Raises:
-        ValueError: for an observer or a driven agent that isn't an agent.
+        ValueError: for an observer or a driven agent that isn't in the fleet.
     """
 
     def __init__(
@@ -79,16 +80,16 @@ class Renderer:
         fleet, agents = design.fleet, len(design.fleet)
         self._fleet, self._title, self._size = fleet, title, size
         self._driven = frozenset(fleet.agent(agent) for agent in driven)
-        self.observer = neediest(design, task_edges) if observer is None else fleet.agent(observer)
-        self._beliefs = Beliefs(design, self.observer)
+        self.observer = default_observer(design, task_edges) if observer is None else fleet.agent(observer)
+        self._estimates = Estimates(design, self.observer)
         self._edges = undirected(np.array(design.communication.edges, int).reshape(-1, 2))
-        self._tasks, self._heard = undirected(task_edges), frozenset(self._edges)
+        self._tasks, self._neighbors = undirected(task_edges), frozenset(self._edges)
         self._headings = headings(fleet)
         self._looks = looks(fleet.models)
         self._look = [self._looks[model.type] for model in fleet.models]
         self._names = short_names(fleet)
         self._crowded = agents > _MOST_LABELS
-        self._labelled = [self.observer, *self._beliefs.targets] if self._crowded else list(range(agents))
+        self._labelled = [self.observer, *self._estimates.targets] if self._crowded else list(range(agents))
 
         self._unit = max(0.75, min(size[0] / 900, size[1] / 720))
         self._radius = self._unit * float(np.clip(9.0 * math.sqrt(20 / agents), 4.5, 9.0))
@@ -103,7 +104,7 @@ class Renderer:
             {f"{kind}  {self._span(kind)}": look for kind, look in self._looks.items()},
             driven=driven_label if self._driven else None,
             task=bool(self._tasks),
-            observer=(fleet.ids[self.observer], self._look[self.observer]) if self._beliefs.targets else None,
+            observer=(fleet.ids[self.observer], self._look[self.observer]) if self._estimates.targets else None,
             error_label=error_label,
             error_unit=fleet.position_unit() if error_unit is None else error_unit,
         )
@@ -119,7 +120,7 @@ class Renderer:
         Args:
             task: bound to the fleet.
             world: of the task.
-            arguments: others of the renderer.
+            arguments: other arguments of the renderer.
         """
         acting = set(task.acting(world))
         driven = [i for i in range(len(world.fleet)) if i not in acting]
@@ -127,7 +128,7 @@ class Renderer:
         return cls(world.design, task.edges, driven=driven, driven_label=label, error_unit=unit, **arguments)
 
     def restart(self) -> None:
-        """Begin a new episode: forget the trails, and where view and labels were."""
+        """Begin a new episode: clear the trails, the view and the places of labels."""
         self._trail: deque[tuple[float, FloatArray]] = deque()
         self._drawn = -math.inf
         self._labels = Labels()
@@ -144,7 +145,7 @@ class Renderer:
             self.restart()
         trail = self._trail
         if (trail and t == trail[-1][0]) or (len(trail) > 1 and t - trail[-2][0] < TRAIL / 100):
-            trail.pop()  # the same moment, or finer than can be seen
+            trail.pop()  # the same time, or closer than is visible
         trail.append((t, self._positions(x)))
         while trail[0][0] < t - TRAIL:
             trail.popleft()
@@ -166,7 +167,7 @@ class Renderer:
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
             task_error: if there is one to show.
-            decorate: draws what a task adds, below the agents.
+            decorate: draws the task's additions, below the agents.
 
         Returns:
             (H, W, 3) pixels, a fresh array.
@@ -185,9 +186,9 @@ class Renderer:
         task_error: float | None = None,
         decorate: Decorate | None = None,
     ) -> None:
-        """Show the picture that `frame` would return in a window, and wait so that there are at most 25 a second.
+        """Show the picture that `frame` would return in a window, at most 25 pictures a second.
 
-        Once the window was closed by hand nothing is shown any more. Without a display SDL draws to none.
+        After the user has closed the window, nothing is drawn. Without a display nothing is visible.
 
         Args:
             t: in s.
@@ -195,7 +196,7 @@ class Renderer:
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
             task_error: if there is one to show.
-            decorate: draws what a task adds, below the agents.
+            decorate: draws the task's additions, below the agents.
 
         Raises:
             ModuleNotFoundError: without pygame-ce.
@@ -233,23 +234,23 @@ class Renderer:
     ) -> Canvas:
         canvas = self._canvas = self._canvas or Canvas(self._size)
         self.remember(t, x)
-        positions, ghosts = self._positions(x), self._beliefs.positions(estimates)
-        self._follow(positions, ghosts, t - self._drawn)
+        positions, estimated = self._positions(x), self._estimates.positions(estimates)
+        self._follow(positions, estimated, t - self._drawn)
         self._drawn = t
-        everyone, targets = np.arange(len(positions)), np.array(self._beliefs.targets, int)
-        middles, ghost_middles = self._pixels(positions, everyone), self._pixels(ghosts, targets)
+        everyone, targets = np.arange(len(positions)), np.array(self._estimates.targets, int)
+        middles, estimate_pixels = self._pixels(positions, everyone), self._pixels(estimated, targets)
 
         canvas.clear()
         self._draw_grid(canvas)
         canvas.clip(self._map)
         self._draw_trails(canvas, t)
-        hidden = self._draw_boxes(canvas, t, ghosts)
+        hidden = self._draw_boxes(canvas, t, estimated)
         if decorate is not None:
-            decorate(_OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
+            decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
         self._draw_edges(canvas, middles)
         self._draw_agents(canvas, x, middles)
-        self._draw_ghosts(canvas, estimates, middles, ghost_middles)
-        self._draw_labels(canvas, middles, ghost_middles)
+        self._draw_estimates(canvas, estimates, middles, estimate_pixels)
+        self._draw_labels(canvas, middles, estimate_pixels)
         canvas.clip(None)
         self._panel.draw(canvas, t, normalized, task_error, hidden)
         canvas.finish()
@@ -259,9 +260,9 @@ class Renderer:
         """(N, d) positions in m, d at most 2; nan where they make no sense."""
         return sensible(x[self._fleet.position_index[:, :2]])
 
-    def _follow(self, positions: FloatArray, ghosts: FloatArray, elapsed: float) -> None:
-        final = self._beliefs.final_half_widths()
-        points = np.concatenate([positions, ghosts - final, ghosts + final])
+    def _follow(self, positions: FloatArray, estimated: FloatArray, elapsed: float) -> None:
+        final = self._estimates.final_half_widths()
+        points = np.concatenate([positions, estimated - final, estimated + final])
         points = points[np.all(np.isfinite(points), axis=1)]
         self._camera.follow(np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), elapsed)
 
@@ -272,7 +273,7 @@ class Renderer:
             pixels[..., 1] = self._rows[agents]
         else:
             pixels = self._camera.pixels(points)
-        return np.clip(pixels, -9999.0, 9999.0)  # what is far out of view has to fit into pygame's integers
+        return np.clip(pixels, -9999.0, 9999.0)  # points far out of view must fit into pygame's integers
 
     def _pixels_in_plane(self, points: FloatArray) -> FloatArray:
         """(..., 2) pixels of points (..., 2) in m that belong to no agent."""
@@ -297,16 +298,16 @@ class Renderer:
         canvas.polygon(corners, "#BBBBBB", 1.0)
         canvas.text(self._title, (left, top / 2), round(14 * self._unit), room=self._size[0] - 2 * left)
 
-    def _draw_boxes(self, canvas: Canvas, t: float, ghosts: FloatArray) -> int:
-        """Draw the guaranteed boxes, and return how many are so large that no edge is in view."""
+    def _draw_boxes(self, canvas: Canvas, t: float, estimated: FloatArray) -> int:
+        """Draw the guaranteed boxes, and return the number of boxes whose edges are all out of view."""
         left, top, width, height = self._map
-        half, targets = self._beliefs.half_widths(t), np.array(self._beliefs.targets, int)
-        low, high = self._pixels(ghosts - half, targets), self._pixels(ghosts + half, targets)
+        half, targets = self._estimates.half_widths(t), np.array(self._estimates.targets, int)
+        low, high = self._pixels(estimated - half, targets), self._pixels(estimated + half, targets)
         hidden = 0
         for target, (x1, y1), (x2, y2) in zip(targets, low, high, strict=True):
             if not np.isfinite([x1, y1, x2, y2]).all():
                 continue
-            if ghosts.shape[1] == 1:
+            if estimated.shape[1] == 1:
                 y1, y2 = y1 + 1.8 * self._radius, y2 - 1.8 * self._radius
             canvas.box((x1, y2, x2 - x1, y1 - y2), self._look[target].color, min(0.1, 0.3 / len(targets)))
             hidden += x1 < left and x2 > left + width and y2 < top and y1 > top + height
@@ -321,7 +322,7 @@ class Renderer:
             places = np.flatnonzero(fresh == shade)
             if not places.size:
                 continue
-            part = paths[max(0, places[0] - 1) : places[-1] + 1]  # from where the shade before ends
+            part = paths[max(0, places[0] - 1) : places[-1] + 1]  # from the end of the previous shade
             for agent, look in enumerate(self._look):
                 path = part[:, agent]
                 canvas.line(path[np.isfinite(path[:, 0])], mix(look.color, strength * shade / _FADES), 2.0 * self._thin)
@@ -332,18 +333,20 @@ class Renderer:
                 canvas.line(middles[[i, j]], EDGE_COLOR, 2.0 * self._thin)
         for i, j in self._tasks:
             if np.isfinite(middles[[i, j]]).all():
-                draw_task_edge(canvas, middles[[i, j]], self._unit, self._thin, beside=(i, j) in self._heard)
+                draw_task_edge(canvas, middles[[i, j]], self._unit, self._thin, beside=(i, j) in self._neighbors)
 
     def _draw_agents(self, canvas: Canvas, x: FloatArray, middles: FloatArray) -> None:
         turned = angles(self._headings, x)
         for agent in np.flatnonzero(np.isfinite(middles).all(axis=1)).tolist():
             at, look = middles[agent], self._look[agent]
-            observing = agent == self.observer and bool(self._beliefs.targets)
+            observing = agent == self.observer and bool(self._estimates.targets)
             draw_agent(canvas, look, at, turned[agent], self._radius, star=agent in self._driven, ring=observing)
 
-    def _draw_ghosts(self, canvas: Canvas, estimates: FloatArray, middles: FloatArray, ghosts: FloatArray) -> None:
-        turned = self._beliefs.headings(estimates)
-        for target, at, heading in zip(self._beliefs.targets, ghosts, turned, strict=True):
+    def _draw_estimates(
+        self, canvas: Canvas, estimates: FloatArray, middles: FloatArray, estimated: FloatArray
+    ) -> None:
+        turned = self._estimates.headings(estimates)
+        for target, at, heading in zip(self._estimates.targets, estimated, turned, strict=True):
             if not np.isfinite(at).all():
                 continue
             color = self._look[target].color
@@ -351,59 +354,26 @@ class Renderer:
                 canvas.line(np.array([at, middles[target]]), color, 1.0 * self._unit)
             canvas.marker(1.55 * self._radius * self._look[target].outline, at, heading, color, 1.5 * self._unit)
 
-    def _draw_labels(self, canvas: Canvas, middles: FloatArray, ghosts: FloatArray) -> None:
-        """Write short names where they cover no marker, with a line to their own where that isn't near."""
+    def _draw_labels(self, canvas: Canvas, middles: FloatArray, estimated: FloatArray) -> None:
+        """Write short names where they cover no marker, with a line to their own marker if it isn't near."""
         size = round(12 * self._unit)
         reach = np.full(len(middles), 1.2 * self._radius)
-        ghost = 2.0 * self._radius
-        reach[[self.observer] * bool(self._beliefs.targets)] = ghost
-        for target, at in zip(self._beliefs.targets, ghosts, strict=True):
-            if np.hypot(*(at - middles[target])) < ghost:
-                reach[target] = ghost
-        shown = [agent for agent in self._labelled if np.isfinite(middles[agent]).all()]
-        extent = np.array([canvas.measure(self._names[agent], size) for agent in shown]).reshape(-1, 2)
+        estimate_reach = 2.0 * self._radius
+        reach[[self.observer] * bool(self._estimates.targets)] = estimate_reach
+        for target, at in zip(self._estimates.targets, estimated, strict=True):
+            if np.hypot(*(at - middles[target])) < estimate_reach:
+                reach[target] = estimate_reach
+        visible = [agent for agent in self._labelled if np.isfinite(middles[agent]).all()]
+        extent = np.array([canvas.measure(self._names[agent], size) for agent in visible]).reshape(-1, 2)
         markers = [
             np.hstack([middles - reach[:, None], middles + reach[:, None]]),
-            np.hstack([ghosts - ghost, ghosts + ghost]),
+            np.hstack([estimated - estimate_reach, estimated + estimate_reach]),
         ]
         taken = np.concatenate(markers)
         taken = taken[np.isfinite(taken).all(axis=1)]
-        places = self._labels.place(middles[shown], extent, reach[shown], taken, self._map)
+        places = self._labels.place(middles[visible], extent, reach[visible], taken, self._map)
         for number, (middle, far) in places.items():
             if far:
-                canvas.line(np.array([middle, middles[shown[number]]]), SOFT, 0.75)
-            text = self._names[shown[number]]
+                canvas.line(np.array([middle, middles[visible[number]]]), SOFT, 0.75)
+            text = self._names[visible[number]]
             canvas.text(text, tuple(middle), size, anchor=(0.5, 0.5), halo=True)
-
-
-class _OnMap:
-    """Drawing in metres, as `tasks.MapCanvas` says.
-
-    Args:
-        canvas: of the frame.
-        pixels: maps points (..., 2) in m to pixels.
-        meters: per pixel.
-        radius: of an agent's marker in pixels.
-    """
-
-    def __init__(
-        self, canvas: Canvas, pixels: Callable[[FloatArray], FloatArray], meters: float, radius: float
-    ) -> None:
-        self._canvas, self._pixels, self._meters, self._radius = canvas, pixels, meters, radius
-
-    def circle(self, center: FloatArray, radius: float, color: str, *, filled: bool = False) -> None:
-        """See `tasks.MapCanvas`."""
-        outline = min(radius / self._meters, 9999.0) * CIRCLE
-        width = 0.0 if filled else 1.5
-        self._canvas.marker(outline, self._pixels(np.asarray(center, float)), 0.0, color, width)
-
-    def line(self, points: FloatArray, color: str, width: float = 2.0) -> None:
-        """See `tasks.MapCanvas`."""
-        self._canvas.line(self._pixels(np.asarray(points, float)), color, width)
-
-    def cross(self, center: FloatArray, color: str) -> None:
-        """See `tasks.MapCanvas`."""
-        middle = self._pixels(np.asarray(center, float))
-        for end in ((1.0, 1.0), (1.0, -1.0)):
-            arm = 0.9 * self._radius * np.array(end)
-            self._canvas.line(np.array([middle - arm, middle + arm]), color, 2.0)

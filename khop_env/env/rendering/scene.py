@@ -1,4 +1,4 @@
-"""What a rendered frame shows, before it is drawn: each type's look, short names, and what one agent believes."""
+"""Contents of a rendered frame: the look of each type, short names, and the estimates of one agent."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from khop_env.observers import FloatArray, FunnelBank, IntArray, ObserverDesign
 from khop_env.physics import AgentModel, Fleet
 
-# M. Okabe and K. Ito, Color Universal Design, 2008: told apart by colour-blind readers, too; yellow left out (too pale)
-# and reddish purple kept for task edges
+# M. Okabe and K. Ito, Color Universal Design, 2008: distinct for colour-blind readers, too; without yellow (too pale)
+# and with reddish purple reserved for task edges
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#000000")
 TASK_COLOR = "#CC79A7"
 EDGE_COLOR = "#6A6A6A"  # darker than task edges also where pink looks grey
@@ -69,7 +69,7 @@ def looks(models: Sequence[AgentModel]) -> dict[str, Look]:
 
 
 def short_names(fleet: Fleet) -> list[str]:
-    """Per agent its number, after as many letters of its type as tell the types apart."""
+    """Per agent the first letters of its type, as many as distinguish the types, and its number."""
     kinds = list(dict.fromkeys(model.type for model in fleet.models))
     length = next(n for n in range(len(max(kinds, key=len)) + 1) if len({kind[:n] for kind in kinds}) == len(kinds))
     return [model.type[:length] + name.rpartition("_")[2] for model, name in zip(fleet.models, fleet.ids, strict=True)]
@@ -86,14 +86,14 @@ def undirected(edges: IntArray) -> list[tuple[int, int]]:
     return sorted({(min(i, j), max(i, j)) for i, j in edges.tolist() if i != j})
 
 
-def neediest(design: ObserverDesign, task_edges: IntArray) -> int:
-    """The agent with most task edges to agents that it can't hear, the first of several."""
-    unheard = [i for i, j in task_edges.tolist() if (j, i) not in design.links.index]
-    return int(np.bincount(unheard, minlength=len(design.fleet)).argmax())
+def default_observer(design: ObserverDesign, task_edges: IntArray) -> int:
+    """The agent with most task edges to k-hop targets, the first of several."""
+    observers = [i for i, j in task_edges.tolist() if (j, i) not in design.links.index]
+    return int(np.bincount(observers, minlength=len(design.fleet)).argmax())
 
 
 def headings(fleet: Fleet) -> IntArray:
-    """(N,) where the fleet's state has each agent's heading; -1 for agents without one."""
+    """(N,) index of each agent's heading in the fleet's state; -1 for agents without a heading."""
     offsets = fleet.state_offset[:-1].tolist()
     return np.array(
         [
@@ -103,8 +103,8 @@ def headings(fleet: Fleet) -> IntArray:
     )
 
 
-class Beliefs:
-    """What one agent believes of the others: where they are, and how far off that may be.
+class Estimates:
+    """Estimated positions of one agent's targets, and the guaranteed bounds on their errors.
 
     Args:
         design: the observers.
@@ -116,7 +116,7 @@ class Beliefs:
 
     def __init__(self, design: ObserverDesign, observer: int) -> None:
         fleet, layout = design.fleet, design.states.layout
-        slots = {target: offset for (who, target), offset in layout.slot.items() if who == observer}
+        slots = {target: offset for (agent, target), offset in layout.slot.items() if agent == observer}
         self.targets = sorted(slots)
         first = {block.agent: block.rows.start for block in layout.blocks}
         d = min(2, fleet.position_dim)
@@ -128,25 +128,25 @@ class Beliefs:
         self._heading = [slots[j] + own[j] - fleet.state_offset[j] if own[j] >= 0 else -1 for j in self.targets]
 
     def positions(self, estimates: FloatArray) -> FloatArray:
-        """(K, d) believed positions in m, d at most 2; nan where they make no sense. `estimates` is (P,)."""
+        """(K, d) estimated positions in m, d at most 2; nan where they can't be drawn. `estimates` is (P,)."""
         return sensible(estimates[self._columns])
 
     def headings(self, estimates: FloatArray) -> FloatArray:
-        """(K,) believed headings in rad, 0 where there are none. `estimates` is (P,)."""
+        """(K,) estimated headings in rad, 0 where there are none. `estimates` is (P,)."""
         return angles(self._heading, estimates)
 
     def half_widths(self, t: float) -> FloatArray:
-        """(K, d) of the box around each belief that the observers guarantee to hold the target, in m, at `t` s."""
+        """(K, d) of the box around each estimate that is guaranteed to hold the target, in m, at `t` s."""
         rows = len(self._bound)
         return self._bound.evaluate(np.array([t]), np.empty((rows, 1))).reshape(self._columns.shape)
 
     def final_half_widths(self) -> FloatArray:
-        """(K, d) of the same as time goes on."""
+        """(K, d) of the box as t goes to infinity, in m."""
         return self._bound.infimum().reshape(self._columns.shape)
 
 
 def sensible(positions: FloatArray) -> FloatArray:
-    """(K, d) positions, nan where they are not finite or absurdly far away."""
+    """(K, d) positions, nan where they are not finite or further away than can be drawn."""
     with np.errstate(invalid="ignore"):
         near = np.all(np.abs(positions) < _FAR, axis=-1, keepdims=True)
     return np.where(near, positions, np.nan)

@@ -1,4 +1,4 @@
-"""Watch the world: twelve agents of four kinds meet, disturbed by gusts, noise and each other."""
+"""Simulate a mixed fleet: twelve agents of four types meet, disturbed by gusts, noise and each other."""
 
 from pathlib import Path
 
@@ -18,4 +18,4 @@ for second in (0, 5, 10, 20):
     positions = fleet.fleet.positions(recording.x[recording.time.searchsorted(second)])
     spread = (positions.max(axis=0) - positions.min(axis=0)).round(2)
     print(f"t = {second:2d} s: the team fills a box of {spread[0]} m x {spread[1]} m")
-print("figure:", paper_figure(recording, fleet, out / "01_world.png"))
+print("figure:", paper_figure(recording, fleet, out / "01_simulate.png"))
