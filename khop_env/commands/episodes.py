@@ -83,7 +83,7 @@ def resolved(name: str, elsewhere: str | None) -> tuple[Task | type[Task] | None
 
 def is_policy(controller: str | None) -> bool:
     """Whether a controller acts through an environment: everything but a law."""
-    from agents import LAWS
+    from agents.laws import LAWS
 
     name = (controller or "").partition(":")[0]
     if controller is None or name in LAWS:
@@ -107,10 +107,10 @@ def continuous(
     seed: int,
 ) -> Episode:
     """The closed loop under a law that is evaluated at every instant."""
-    from agents import make_law
+    from agents.laws import make_law
     from khop_env.observers import Explicit, Proximal
     from khop_env.scenarios.scenario import number_of_steps
-    from khop_env.simulation.simulator import parts_of_step
+    from khop_env.simulation.plant import parts_of_step
 
     order, explicit = steps["--order"], steps["--integrator"] is not None
     if explicit and order is OrderOption.TWO:
@@ -203,7 +203,7 @@ def result_of(played: PolicyRun, recording: Recording) -> dict[str, Any]:
 
 
 def _law(scenario: Scenario, controller: str | None) -> LawChoice:
-    from agents import LAWS
+    from agents.laws import LAWS
     from khop_env.registry import parameters_from_text
     from khop_env.scenarios import LawChoice
 

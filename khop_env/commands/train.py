@@ -22,6 +22,7 @@ from khop_env.commands.common import (
     print_json,
 )
 from khop_env.commands.folders import folder_name
+from khop_env.extras import how_to_install
 from khop_env.terminal import Progress, print_text, say, waiting
 
 if TYPE_CHECKING:
@@ -109,7 +110,7 @@ def train(
         try:
             from agents.learning.training import train
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(f"training needs {error.name}: pip install 'khop_env[rl]'") from error
+            raise ModuleNotFoundError(f"training needs {error.name}: {how_to_install('rl')}") from error
         from agents.learning.environment import build
         from agents.policy import describe
 
