@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from playing import EVERY, batched, built, parallel, play
+
+from tests.env.playing import EVERY, batched, built, parallel, play
 
 every = pytest.mark.parametrize(("environment", "name"), EVERY)
 uniform_or_ragged = pytest.mark.parametrize("uniform", [True, False])

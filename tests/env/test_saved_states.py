@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from playing import batched, parallel, play, same, state
 
 from khop_env import consensus_v0
 from khop_env.env import Lag
+from tests.env.playing import batched, parallel, play, same, state
 
 
 def test_states_of_other_environments_are_refused_and_change_nothing():

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from strategies import SEEDS, connected_graphs, definition_of_m, hops, observers_of, systems
 
 from khop_env.observers import DesignError, Exponential, ObserverDesign, TargetObservers
 from khop_env.observers.disagreement import disagreement
 from khop_env.physics import DriftingIntegrator, Fleet, SingleIntegrator, Unicycle
+from tests.strategies import SEEDS, connected_graphs, definition_of_m, hops, observers_of, systems
 
 TIMES = np.array([0.0, 0.01, 0.1, 0.5, 1.0, 3.0, 30.0])
 ONE = Exponential(1.0, 0.5, 1.0)

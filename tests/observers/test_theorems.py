@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import OBSERVABLE_INPUT, PLANAR, SmoothSignals, System, definition_of_m, observers_of, systems
 
 from agents import TanhConsensus
 from khop_env.observers import Explicit, Exponential, ObserverDesign, PairLayout, Proximal, TargetObservers
 from khop_env.physics import DriftingIntegrator, Fleet
 from khop_env.simulation import InitialSet, Simulator
+from tests.strategies import OBSERVABLE_INPUT, PLANAR, SmoothSignals, System, definition_of_m, observers_of, systems
 
 BOTH = pytest.mark.parametrize("integrator", ["proximal", "explicit"])
 
