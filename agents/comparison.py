@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
 CHUNK = 25  # episodes per batch; fixed, so that results don't depend on the number of workers
 
-_Arguments = tuple[tuple[str, Any], ...]
-_Task = tuple[str, Observe, _Arguments, tuple[int, ...]]  # policy, ..., seeds
+_Task = tuple[str, Observe, bool, tuple[int, ...]]  # policy, observation mode, with bounds, seeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +101,9 @@ class Comparison:
         for row, summary in zip(self.rows, summaries, strict=True):
             if len(row.episodes.seed) < self.planned:
                 summary["episodes"] = len(row.episodes.seed)
-        return {
-            "environment": self.environment,
-            "scenario": self.scenario,
-            "episodes": self.planned,
-            "rows": summaries,
-        }
+        where = {"environment": self.environment, "scenario": self.scenario, "episodes": self.planned}
+        unit = self.rows[0].env.error_unit if self.rows else None
+        return {**where, "task_error_unit": unit, "rows": summaries}
 
     def difference(self, row: Row) -> tuple[float, float | None]:
         """Mean difference in return from the first row, paired by episode, and half width of its 95 % interval."""
@@ -165,21 +161,20 @@ def compare(
             f"expected at least one policy and one observation mode, no mode twice; got policies={list(policies)} and "
             f"observe={list(observe)}"
         )
-    player = _Player(environment, chosen_scenario(environment, scenario))
-    rows: list[tuple[str, EnvDescription, _Arguments]] = []
+    player = _Player(environment, chosen_scenario(environment, scenario), arguments or {})
+    rows: list[tuple[str, EnvDescription, bool]] = []
     for spec in policies:  # check that each policy fits before the first episode
         policy = make_policy(spec)
-        with_bounds = {"bounds": True} if isinstance(policy, LearnedPolicy) and policy.about.get("bounds") else {}
-        chosen = tuple(sorted({**with_bounds, **(arguments or {})}.items()))
+        bounds = isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
         for mode in observe:
-            env = describe(player.environment(mode, chosen))
-            rows.append((spec, env, chosen))
+            env = describe(player.environment(mode, bounds))
+            rows.append((spec, env, bounds))
             try:
                 policy.reset(env, [0])
             except ValueError as error:
                 raise ValueError(f"policy {spec!r}: {error}") from error
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
-    tasks: list[_Task] = [(spec, env.observe, chosen, chunk) for spec, env, chosen in rows for chunk in chunks]
+    tasks: list[_Task] = [(spec, env.observe, bounds, chunk) for spec, env, bounds in rows for chunk in chunks]
     results: list[Episodes | None] = [None] * len(tasks)
 
     def comparison() -> Comparison:
@@ -225,20 +220,21 @@ def interval95(values: FloatArray) -> float | None:
 class _Player:
     """Runs tasks; builds one environment per observation mode and arguments, never shared with another object."""
 
-    def __init__(self, environment: Environment, scenario: Scenario) -> None:
-        self._environment, self._scenario = environment, scenario
-        self._made: dict[tuple[Observe, _Arguments], BatchedEnv] = {}
+    def __init__(self, environment: Environment, scenario: Scenario, arguments: Mapping[str, Any]) -> None:
+        self._environment, self._scenario, self._arguments = environment, scenario, dict(arguments)
+        self._made: dict[tuple[Observe, bool], BatchedEnv] = {}
 
-    def environment(self, observe: Observe, arguments: _Arguments) -> BatchedEnv:
-        """The environment for this observation mode and these arguments, with num_envs = CHUNK."""
-        if (observe, arguments) not in self._made:
-            env = make_batched(self._environment, self._scenario, num_envs=CHUNK, observe=observe, **dict(arguments))
-            self._made[observe, arguments] = env
-        return self._made[observe, arguments]
+    def environment(self, observe: Observe, bounds: bool) -> BatchedEnv:
+        """The environment, with num_envs = CHUNK; with bounds in observations unless the arguments say otherwise."""
+        if (observe, bounds) not in self._made:
+            arguments = {"bounds": True, **self._arguments} if bounds else self._arguments
+            env = make_batched(self._environment, self._scenario, num_envs=CHUNK, observe=observe, **arguments)
+            self._made[observe, bounds] = env
+        return self._made[observe, bounds]
 
     def __call__(self, task: _Task) -> Episodes:
-        spec, observe, arguments, seeds = task
-        return play(self.environment(observe, arguments), make_policy(spec), seeds, name=spec)
+        spec, observe, bounds, seeds = task
+        return play(self.environment(observe, bounds), make_policy(spec), seeds, name=spec)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_made": {}}

@@ -33,7 +33,7 @@ class Episodes:
     Attributes:
         seed: (E,) seed of each episode.
         returns: (E,) mean over the agents of the sum of their rewards.
-        final_task_error: (E,) mean over the agents of their task error at the end, in m.
+        final_task_error: (E,) mean over the agents of their task error at the end, in the task's unit.
         settling_time: (E,) time from which the team's mean task error stays at or below a tenth of the initial one, in
             s; infinite if it doesn't.
         effort: (E,) mean over agents and time of |u|^2, u in fractions of the input limits.

@@ -9,7 +9,7 @@ from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import Policy
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
-from khop_env.objects import is_object_name, load_object
+from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
 from khop_env.registry import environments, parameters_from_text
 
@@ -68,7 +68,7 @@ def make_policy(spec: str) -> Policy:
 
 def _user_policy(spec: str) -> Policy:
     loaded = load_object(spec)
-    policy = loaded() if isinstance(loaded, type) else loaded
+    policy = called(spec, loaded) if isinstance(loaded, type) else loaded
     if not (callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None))):
         raise ValueError(
             f"policy {spec!r}: expected an object with reset(env, seeds) and act(observations); got "

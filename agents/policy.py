@@ -30,6 +30,7 @@ class EnvDescription:
         models: model of each acting agent, by id, in the environment's order.
         layouts: layout of each agent's observation, by id.
         action_sizes: number of entries of each agent's action, padding included, by id.
+        error_unit: unit of the task error.
     """
 
     environment: str
@@ -39,6 +40,7 @@ class EnvDescription:
     models: Mapping[str, AgentModel]
     layouts: Mapping[str, ObservationLayout]
     action_sizes: Mapping[str, int]
+    error_unit: str = "m"
 
     __repr__ = brief
 
@@ -88,6 +90,7 @@ def describe(env: object) -> EnvDescription:
         models={agent: fleet.models[fleet.agent(agent)] for agent in batched.agents},
         layouts=dict(zip(batched.agents, batched.layouts, strict=True)),
         action_sizes=dict(zip(batched.agents, sizes.tolist(), strict=True)),
+        error_unit=batched.task.error_unit(batched.world),
     )
 
 

@@ -8,31 +8,43 @@ from typing import Any
 
 import numpy as np
 
-from agents.learning.learned import PretrainedPolicy
+from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policies import make_policy
 from agents.policy import Policy, describe, policy_seeds
 from khop_env.env import KHopEnv, Settings
-from khop_env.observers import Extremes
-from khop_env.registry import make
+from khop_env.objects import described
+from khop_env.observers import Extremes, FunnelError, SolveError
+from khop_env.registry import Environment, environments, find_task, make
+from khop_env.results.recording import StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
 
 
 class PolicyRun:
-    """A policy in closed loop with its environment, to be passed to `results.record`; a step is a control period.
+    """Stands in for a simulator in `results.record`: its steps are control periods of an environment with a policy.
 
     Args:
         env: the environment; it is reset.
-        policy: the policy.
-        seed: seed of the episode.
+        policy: chooses the actions.
+        seed: of the episode.
+        name: of the policy, for errors.
+
+    Attributes:
+        episode_return: mean over the agents of the rewards so far.
     """
 
-    def __init__(self, env: KHopEnv, policy: Policy, seed: int) -> None:
-        self.env, self.policy = env, policy
+    def __init__(self, env: KHopEnv, policy: Policy, seed: int, name: str = "policy") -> None:
+        self.env, self.policy, self.name = env, policy, name
         self.simulator: Simulator = env.batched.simulator
-        policy.reset(describe(env), policy_seeds([seed]))
+        try:
+            policy.reset(describe(env), policy_seeds([seed]))
+        except ValueError:
+            raise
+        except Exception as error:
+            raise ValueError(f"policy {name!r} raised {described(error)}") from error
         self._observations, _ = env.reset(seed=seed)
         self._extremes = self.simulator.extremes
+        self.episode_return = 0.0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.simulator, name)
@@ -52,29 +64,102 @@ class PolicyRun:
         """Current task error, mean over the agents."""
         return float(self.env.batched.task_errors().mean())
 
+    def ended(self) -> bool:
+        """Whether the episode is over, at its horizon or because the task ended it."""
+        return not self.env.agents
+
     def step(self, dt: float) -> None:
-        """Advance by one control period; `dt` must be its length."""
-        actions: Mapping[str, Any] = self.policy.act(self._observations)
-        self._observations, *_ = self.env.step(actions)
+        """One control period, whose length `dt` has to be.
+
+        Raises:
+            StoppedError: if the policy fails, or its actions are refused.
+        """
+        actions: Mapping[str, Any] = self._guarded(self.policy.act, self._observations)
+        self._observations, rewards, *_ = self._guarded(self.env.step, actions)
+        self.episode_return += float(np.mean(list(rewards.values())))
         for running, now in zip(self._extremes, self.simulator.extremes, strict=True):
             np.maximum(running, now, out=running)
 
+    def _guarded(self, function: Any, *arguments: Any) -> Any:
+        """What a function returns; its exceptions don't lose what was recorded before."""
+        try:
+            return function(*arguments)
+        except (FunnelError, SolveError):
+            raise
+        except ValueError as error:
+            raise StoppedError(f"policy {self.name!r}: {error}") from error
+        except Exception as error:
+            raise StoppedError(f"policy {self.name!r} raised {described(error)}") from error
 
-def policy_run(spec: str, scenario: Scenario, observe: Observe, duration: float, seed: int) -> PolicyRun:
-    """A learned policy in the environment that it was trained for.
+
+def policy_run(
+    spec: str,
+    scenario: Scenario,
+    observe: Observe,
+    duration: float | None,
+    seed: int,
+    *,
+    environment: Environment | None = None,
+    arguments: Mapping[str, Any] | None = None,
+) -> PolicyRun:
+    """A policy in an environment, at the beginning of an episode.
+
+    A learned policy gets the bounds and arguments that it was trained with, unless `arguments` have others.
 
     Args:
-        spec: e.g. "ppo:runs/first"; "ppo:pretrained" if a single policy is shipped for the scenario.
-        scenario: scenario of the environment.
+        spec: what `make_policy` takes, e.g. "zero", "tanh" or "ppo:runs/mine".
+        scenario: where it acts.
         observe: observation mode.
-        duration: length of the episode in s, rounded up to whole control periods.
-        seed: seed of the episode.
+        duration: of the episode in s, rounded up to whole control periods; None for that of the environment.
+        seed: of the episode.
+        environment: name or task; `environment_for` chooses by default.
+        arguments: of the environment.
 
     Raises:
-        PolicyFileError: if the policy doesn't fit the environment.
+        ValueError: for a policy that doesn't fit, an environment that isn't known, or both a duration and max_cycles.
     """
-    policy = make_policy(spec)
-    about = policy.about_for(scenario.name) if isinstance(policy, PretrainedPolicy) else policy.about  # type: ignore[attr-defined]
-    cycles = max(1, math.ceil(duration / Settings.control_period - 1e-9))
-    env = make(about["environment"], scenario, observe=observe, bounds=about["bounds"], max_cycles=cycles)
-    return PolicyRun(env, policy, seed)
+    policy, chosen = make_policy(spec), dict(arguments or {})
+    environment = environment_for(spec, scenario) if environment is None else environment
+    task = find_task(environment)
+    named = f"{task.name}_v{task.version}"
+    about = _training(policy, named, scenario)
+    if about.get("environment") == named:
+        chosen = {"bounds": about["bounds"], **about.get("arguments", {}), **chosen}
+    if duration is not None:
+        if "max_cycles" in (arguments or {}):
+            raise ValueError("a duration and max_cycles: choose one of them for the length of the episode")
+        period = chosen.get("control_period", Settings.control_period)
+        chosen["max_cycles"] = max(1, math.ceil(duration / period - 1e-9))
+    return PolicyRun(make(environment, scenario, observe=observe, **chosen), policy, seed, spec)
+
+
+def environment_for(spec: str, scenario: Scenario) -> str:
+    """The environment in which a policy acts where none is named.
+
+    Args:
+        spec: of the policy, as for `policy_run`.
+        scenario: where it acts.
+
+    Returns:
+        What a learned policy was trained for; for others the environment of the scenario's law, or consensus.
+
+    Raises:
+        ValueError: if a learned policy was trained for a task that isn't of the library.
+    """
+    of_law = f"{scenario.law.name}_v0"
+    other = of_law if of_law in environments() else "consensus_v0"
+    found: str = _training(make_policy(spec), None, scenario).get("environment", other)
+    if found not in environments():
+        raise ValueError(
+            f"{spec} was trained for {found}, which isn't of the library: name its task, as in "
+            f"khop run my_file.py:MyTask --controller {spec}"
+        )
+    return found
+
+
+def _training(policy: Policy, environment: str | None, scenario: Scenario) -> Mapping[str, Any]:
+    """How a learned policy was trained; nothing of others."""
+    if isinstance(policy, PretrainedPolicy):
+        policy.environment = policy.environment or environment
+        return policy.about_for(scenario.name)
+    return policy.about if isinstance(policy, LearnedPolicy) else {}

@@ -6,9 +6,9 @@ The module `khop_env/<name>.py` is the environment's page, in PettingZoo's forma
 from __future__ import annotations
 
 ENVIRONMENTS = {
-    "consensus_v0": "Consensus",
-    "formation_v0": "Formation",
-    "leader_following_v0": "LeaderFollowing",
+    "consensus_v0": "khop_env.tasks.consensus:Consensus",
+    "formation_v0": "khop_env.tasks.formation:Formation",
+    "leader_following_v0": "khop_env.tasks.leader_following:LeaderFollowing",
 }
 
 

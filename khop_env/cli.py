@@ -1,15 +1,17 @@
 """The command line, `khop`.
 
-Tables and one JSON object (`--json`) go to stdout; progress and messages to stderr. Exit status: 0, or 1 where a check
-or a run finds the observers' guarantee or the environments' contract broken, or 2 for a mistake in what was asked, or
-where something failed on the way; 130 after Ctrl-C, where what was done until then is printed.
+Tables and one JSON object (`--json`) go to stdout; progress and messages to stderr. Exit status: 0; 1 where a check or
+a run finds the observers' guarantee or the environments' contract broken; 2 for a mistake of the user's, or where
+something failed on the way; 130 after Ctrl-C, with the results up to then.
 """
 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -36,16 +38,25 @@ app = typer.Typer(
 )
 
 
-app.command("list")(list_scenarios)
-app.command()(check)
-app.command()(run)
-app.command()(export)
-app.command()(evaluate)
-app.command()(train)
-app.command()(tune)
-app.command()(iss)
-app.command("test")(contract)
-app.command()(bench)
+def _help(command: Callable[..., None]) -> str:
+    """A docstring whose paragraphs are a line each, for the terminal to fold."""
+    return "\n\n".join(" ".join(part.split()) for part in (inspect.getdoc(command) or "").split("\n\n"))
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "list": list_scenarios,
+    "check": check,
+    "run": run,
+    "export": export,
+    "evaluate": evaluate,
+    "train": train,
+    "tune": tune,
+    "iss": iss,
+    "test": contract,
+    "bench": bench,
+}
+for name, command in COMMANDS.items():
+    app.command(name, help=_help(command))(command)
 
 
 def main() -> None:

@@ -7,11 +7,14 @@ import importlib.util
 import os
 import sys
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from khop_env.own_agents import AGENTS
+
+Result = TypeVar("Result")
 
 _LISTED = 8  # names of a module in an error message
 
@@ -46,6 +49,25 @@ def load_object(name: str) -> Any:
             raise ValueError(f"{owner} has no {part!r}; it has {listed or 'no public names'}")
         found = getattr(found, part)
     return found
+
+
+def called(name: str, function: Callable[..., Result], *arguments: Any, **keywords: Any) -> Result:
+    """What a user's function or class returns, or where it went wrong.
+
+    Args:
+        name: where it was found, for the error.
+        function: to call.
+        arguments: of it.
+        keywords: of it.
+
+    Raises:
+        ValueError: if it raises anything, with the file and the line, and the exception itself as the cause.
+    """
+    try:
+        return function(*arguments, **keywords)
+    except Exception as error:
+        file = getattr(sys.modules.get(getattr(function, "__module__", "")), "__file__", None) or ""
+        raise ValueError(f"{name} raised {described(error, file)}") from error
 
 
 def is_object_name(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""What the command line shows: tables and summaries on stdout, progress and messages on stderr."""
+"""The command line's output: tables and summaries on stdout, progress and messages on stderr."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import typer
 SHOWN_TARGETS = 20
 _SHOWN_IDS = 6  # of a k-hop set
 _PAGE = 80  # columns
-_PIPED_WIDTH = 160  # columns, where stdout is no terminal that could tell
 
 _UNSURE = 0.5  # s of work before it is guessed how long it will take
 _LONG = 2.0  # s: work that takes longer gets a progress bar
@@ -86,7 +85,7 @@ def print_table(
     rows: Sequence[Sequence[str]],
     title: str | None = None,
     *,
-    width: int = _PIPED_WIDTH,
+    width: int = _PAGE,
     whole: Sequence[str] = (),
 ) -> None:
     """A table on stdout; cells are folded between words.
@@ -97,21 +96,47 @@ def print_table(
         title: above it.
         width: in characters, where stdout is no terminal that has one.
         whole: columns that aren't folded at all.
+
+    Where the longest words don't fit, the table is wider than asked for: words aren't broken.
     """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False, show_edge=False
-    )
-    for number, name in enumerate(header):
-        longest = max(len(word) for text in (name, *(row[number] for row in rows)) for word in [*text.split(), ""])
-        table.add_column(name, overflow="fold", min_width=longest, no_wrap=name in whole)
+    columns = [[name, *(row[number] for row in rows)] for number, name in enumerate(header)]
+    lengths = [[max(map(len, ["", *cell.splitlines()])) for cell in cells] for cells in columns]
+    words = [max(len(word) for cell in cells for word in [*cell.split(), ""]) for cells in columns]
+    least = [max(full) if name in whole else few for name, full, few in zip(header, lengths, words, strict=True)]
+    available = Console().width if sys.stdout.isatty() else width
+    widths = _narrowed(lengths, least, available - 2 * (len(header) - 1))
+    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.pad_edge, table.show_edge = False, False
+    for name, chosen in zip(header, widths, strict=True):
+        table.add_column(name, width=chosen, overflow="fold")
     for row in rows:
         table.add_row(*row)
-    console = Console(width=None if sys.stdout.isatty() else width, markup=False, highlight=False)
-    console.print(table)
+    total = max(available, sum(widths) + 2 * len(widths))
+    Console(width=total, markup=False, highlight=False).print(table)
+
+
+def _narrowed(lengths: Sequence[Sequence[int]], least: Sequence[int], room: int) -> list[int]:
+    """Widths of columns that fit into `room` as far as their least widths let them.
+
+    Columns whose header alone is folded are narrowed first, then those with fewest folded cells, then the widest.
+
+    Args:
+        lengths: of each column's cells, the header first.
+        least: width of each column.
+        room: for all.
+    """
+    widths = [max(cells) for cells in lengths]
+
+    def cost(q: int) -> tuple[int, int]:
+        return sum(length >= widths[q] for length in lengths[q][1:]), -widths[q]
+
+    while sum(widths) > room and (rest := [q for q in range(len(widths)) if widths[q] > least[q]]):
+        widths[min(rest, key=cost)] -= 1
+    return widths
 
 
 def print_text(text: str) -> None:
@@ -121,7 +146,9 @@ def print_text(text: str) -> None:
 
 def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None:
     """A run in a few lines."""
-    observed = {"estimate": "estimates", "oracle": "the truth (oracle)", "local": "neighbours only"}[summary["observe"]]
+    observed = {"estimate": "estimates", "oracle": "true states (oracle)", "local": "neighbours only"}[
+        summary["observe"]
+    ]
     print_text(
         f"{summary['scenario']}: {summary['agents']} agents, {summary['pairs']} pairs of observer and target, "
         f"{summary['duration']:.6g} s in steps of {summary['dt']:g} s ({summary['integrator']}, order "
@@ -134,24 +161,34 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
         ratios += f"|g_tilde|/theta {_ratio(summary['max_error_to_bound_input'])}"
     if summary["funnel_kept"]:
         print_text(f"guarantee kept: largest {ratios} (all below 1)")
+        if summary["error"] is not None or summary.get("terminated"):
+            how = "the episode stopped early" if summary["error"] is not None else "the task ended the episode"
+            print_text(f"{how}, at t = {summary['duration']:.6g} s")
     elif summary["error"] is not None:
         print_text(f"guarantee not kept: stopped at t = {summary['duration']:.6g} s; until then largest {ratios}")
     else:
         print_text(f"guarantee not kept: largest {ratios} (should be below 1)")
     if "environment" in summary:
-        print_text(f"{summary['environment']}: task error at the end {summary['final_task_error']:.4g} m")
+        error = _number(summary["final_task_error"], summary["task_error_unit"])
+        print_text(
+            f"{summary['environment']}: return {_number(summary['return'])}, task error at the end {error} (both means "
+            "over the agents)"
+        )
     else:
-        error = summary["final_consensus_error"]
-        print_text(f"consensus error at the end: {'not finite' if error is None else f'{error:.4g} m'}")
+        error = _number(summary["final_consensus_error"], summary["position_unit"])
+        print_text(f"consensus error at the end: {error} (|Pi p|: distance of all positions together from their mean)")
     if summary["diverged"]:
         print_text(
             "the states grew without bound: it seems that the plant diverged; try a smaller --dt, or another law"
         )
     print_text(f"wall time: {summary['wall_time_s']:.3g} s for {summary['steps']} steps")
-    tables = ", ".join(str(files[name]) for name in ("estimates", "states") if name in files)
-    for what, where in (("tables", tables), ("summary", files.get("summary")), ("figure", files.get("figure"))):
-        if where:
-            typer.echo(f"{what}: {where}")
+    for name in ("estimates", "states", "summary", "figure", "video"):
+        if name in files:
+            typer.echo(f"{name}: {files[name]}")
+
+
+def _number(value: float | None, unit: str = "") -> str:
+    return "not finite" if value is None else f"{value:.4g} {unit}".strip()
 
 
 def _ratio(value: float | None) -> str:
@@ -176,7 +213,6 @@ def print_design(report: Mapping[str, Any]) -> None:
             ("target", "k-hop set", "eta", "lambda(M)"),
             [_spectrum_row(target) for target in shown],
             "Observers, by the agent that they estimate",
-            width=_PAGE,
             whole=("target", "lambda(M)"),
         )
         typer.echo()
@@ -184,7 +220,6 @@ def print_design(report: Mapping[str, Any]) -> None:
             ("target", "of", "delta, theta", "rho, omega", "rate (1/s)", "start / funnel"),
             [row for target in shown for row in _funnel_rows(target)],
             "Bounds on errors and funnels on disagreements, at t = 0 -> infinity",
-            width=_PAGE,
             whole=("target", "delta, theta", "rho, omega"),
         )
         if len(targets) > SHOWN_TARGETS:
@@ -199,8 +234,10 @@ def print_design(report: Mapping[str, Any]) -> None:
         )
     if report["assumptions"]:
         typer.echo()
-        rows = [(one["number"], one["status"], f"{one['statement']}: {one['why']}") for one in report["assumptions"]]
-        print_table(("", "status", "assumption of the paper, and why"), rows, width=_PAGE, whole=("", "status"))
+        rows = [
+            (each["number"], each["status"], f"{each['statement']}: {each['why']}") for each in report["assumptions"]
+        ]
+        print_table(("", "status", "assumption of the paper, and why"), rows, whole=("", "status"))
     for warning in report["warnings"]:
         print_text(f"warning: {warning}")
     if report["feasible"]:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import khop_env
 from khop_env import __version__
-from khop_env.cli import app
+from khop_env.cli import COMMANDS, app
 
 
 def khop(*arguments: str, status: int = 0):
@@ -39,6 +39,9 @@ def refused(*arguments: str) -> str:
     return lines[0]
 
 
+FILES = ("estimates: ", "states: ", "summary: ", "figure: ", "injected: ", "swept: ")  # lines with a path
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -57,6 +60,9 @@ class TestList:
         assert found["environments"] == ["consensus_v0", "formation_v0", "leader_following_v0"]
 
 
+LONG = "linear:gain=2,cancel_drift=true"
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -65,13 +71,20 @@ class TestList:
         ["check", "mixed_fleet"],
         ["check", "random_geometric:agents=60,k=4"],
         ["run", "mixed_fleet", "--duration", "0.05"],
+        ["run", "consensus_v0", "--controller", "zero", "--duration", "0.1"],
+        ["iss", "paper", "--episodes", "1", "--duration", "0.5"],
+        ["evaluate", "leader_following_v0", "--policies", f"{LONG},ppo:pretrained", "--episodes", "2"],
     ],
     ids=" ".join,
 )
 def test_tables_fit_80_columns_and_break_between_words(arguments, folder):
     found = khop(*arguments).stdout
-    lines = [line.rstrip() for line in found.splitlines() if not line.startswith(("tables: ", "summary: ", "figure: "))]
+    lines = [line.rstrip() for line in found.splitlines() if not line.startswith(FILES)]
     assert max(len(line) for line in lines) <= 80
+    if arguments[0] == "evaluate":
+        assert {"linear:gain=2,", "cancel_drift=true", "ppo:pretrained", "oracle"} <= set(found.split())
+        assert found.count("±") == 11  # six returns, five differences
+        assert any(line.rstrip().endswith("bound") for line in found.partition("──")[0].splitlines())  # the last column
     if arguments[0] == "check":
         words = set(found.split())
         report = only_json(khop(*arguments, "--json"))
@@ -130,7 +143,7 @@ class TestCheck:
 class TestRun:
     def test_everything_is_written(self, folder):
         result = khop("run", "paper", "--duration", "0.5", "--seed", "3")
-        out = folder / "runs" / "paper"
+        out = folder / "runs" / "paper-tanh-estimate-seed3"
         assert sorted(path.name for path in out.iterdir()) == [
             "estimates.parquet",
             "figure.png",
@@ -145,7 +158,7 @@ class TestRun:
         assert "guarantee kept" in result.stdout
         assert f"{summary['max_normalized_disagreement']:.3f}" in result.stdout
         assert f"{summary['max_error_to_bound_input']:.3f}" in result.stdout
-        assert "figure: runs/paper/figure.png" in result.stdout
+        assert "figure: runs/paper-tanh-estimate-seed3/figure.png" in result.stdout
         estimates = pl.read_parquet(out / "estimates.parquet")
         assert estimates["time"].n_unique() == 51
         assert (estimates["error"] - (estimates["estimate"] - estimates["state"])).abs().max() == 0.0
@@ -223,7 +236,7 @@ class TestRun:
         result = khop(*arguments, status=1)
         assert "the plant diverged" in result.stdout
         assert "Warning" not in result.stderr
-        assert len(list((folder / "runs" / "points").iterdir())) == 4
+        assert len(list((folder / "runs" / "points-linear-estimate-seed0").iterdir())) == 4
         found = only_json(khop(*arguments, "--json", status=1))
         assert found["funnel_kept"] is False
         assert found["diverged"] is True
@@ -246,7 +259,7 @@ class TestRun:
         assert len(list((folder / "out").iterdir())) == 4
 
     def test_films_that_could_not_be_made_are_refused_before_anything_is_computed(self, folder, monkeypatch):
-        assert "ends in .mp4 or .gif" in refused("run", "paper", "--video", "film.avi")
+        assert "must end in .mp4 or .gif" in refused("run", "paper", "--video", "film.avi")
         assert "did you mean 'drifter_" in refused("run", "paper", "--video", "film.gif", "--observer", "driftr_1")
         assert "no agent 8" in refused("run", "paper", "--video", "film.gif", "--observer", "8")
         assert "give --video FILE, too" in refused("run", "paper", "--observer", "1")
@@ -266,7 +279,7 @@ class TestRun:
         (folder / "mine.toml").write_text(khop("export", "paper").stdout.replace('"paper"', f'"{name}"'))
         khop("run", "mine.toml", "--duration", "0.02")
         assert [path.name for path in folder.iterdir() if path.is_dir()] == ["runs"]
-        assert [path.name for path in (folder / "runs").iterdir()] == [expected]
+        assert [path.name for path in (folder / "runs").iterdir()] == [f"{expected}-tanh-estimate-seed0"]
 
     @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that Linux has")
     def test_stdout_that_is_full_is_one_line(self, folder):
@@ -287,7 +300,10 @@ class TestRun:
 
     def test_refusals(self, folder):
         assert "no scenario 'papr'; did you mean 'paper'?" in refused("run", "papr")
-        assert "no law 'tan'; did you mean 'tanh'?" in refused("run", "paper", "--controller", "tan")
+        assert "no law or policy 'tan'; did you mean 'tanh'?" in refused("run", "paper", "--controller", "tan")
+        assert "no law or policy 'zro'; did you mean 'zero'?" in refused("run", "paper", "--controller", "zro")
+        said = refused("run", "consensus")
+        assert said == "khop: no scenario or environment 'consensus'; did you mean 'consensus_v0'?"
         assert "khop: dt must be positive and finite; got 0.0" in refused("run", "paper", "--dt", "0")
         assert "khop: duration must be positive" in refused("run", "paper", "--duration", "-1")
         assert "dt must be from 1e-09 to 1e+09 s; got 1e-300" in refused("run", "paper", "--dt", "1e-300")
@@ -399,6 +415,17 @@ def test_version():
     assert khop("--version").stdout == f"{__version__}\n"
 
 
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_is_folded_between_words(command, monkeypatch):
+    """Paragraphs fill their lines, and nothing is cut off with an ellipsis."""
+    monkeypatch.setenv("COLUMNS", "80")
+    found = khop(command, "--help").stdout
+    assert max(map(len, found.splitlines())) <= 80
+    assert "…" not in found
+    paragraphs = " ".join(found.partition("╭")[0].split())
+    assert " ".join(COMMANDS[command].__doc__.split()) in paragraphs
+
+
 def test_help_names_every_command():
     found = khop("--help").stdout
     for command in ("list", "check", "run", "export", "bench"):
@@ -410,4 +437,4 @@ def test_as_a_module_in_a_process_of_its_own(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(Path(khop_env.__file__).parents[1])}
     found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert json.loads(found.stdout)["funnel_kept"] is True
-    assert (tmp_path / "runs" / "paper" / "figure.png").exists()
+    assert (tmp_path / "runs" / "paper-tanh-estimate-seed0" / "figure.png").exists()

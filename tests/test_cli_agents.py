@@ -23,7 +23,7 @@ def test_evaluate_prints_json():
         *("--observe", "estimate,local", "--episodes", "3", "--json"),
     )
     found = json.loads(result.stdout)
-    assert list(found) == ["environment", "scenario", "episodes", "rows"]
+    assert list(found) == ["environment", "scenario", "episodes", "task_error_unit", "rows"]
     assert (found["environment"], found["scenario"], found["episodes"]) == ("leader_following_v0", "paper", 3)
     keys = ["policy", "observe", "mean_return", "ci95", "final_task_error", "settling_time", "effort"]
     keys += ["max_normalized_disagreement", "max_error_to_bound"]
@@ -86,10 +86,13 @@ def test_iss(tmp_path):
     found = json.loads(result.stdout)
     assert found["holds"] is True
     assert {row["observers"] for row in found["swept"]} == {"as designed", "bare"}
-    assert all((tmp_path / name).exists() for name in ("figure.png", "injected.csv", "swept.csv"))
+    assert all((tmp_path / name).exists() for name in ("figure.png", "injected.csv", "swept.csv", "summary.json"))
     slopes = {(row["observers"], row["disturbed"]): row["slope"] for row in found["slopes"]}
     assert slopes["bare", True] > 1.5
-    table = khop("iss", "paper", "--episodes", "1", "--duration", "1", "--out", str(tmp_path)).stdout
+    other = "iss", "paper", "--episodes", "1", "--duration", "1", "--out"
+    said = khop(*other, str(tmp_path), status=2).stderr
+    assert "another run is there (episodes is 2 there and 1 here; duration is 4.0 there and 1.0 here;" in said
+    table = " ".join(khop(*other, str(tmp_path / "other")).stdout.split())
     assert "analytical gain: for distances up to 0.656 m; it says something of" in table
     assert "and none exceeds it" in table
     assert "slope of log excess with disturbance" in table

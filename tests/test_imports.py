@@ -29,6 +29,7 @@ RANKS = [
     ["khop_env.env"],
     ["khop_env.scenarios"],
     ["khop_env.registry", "khop_env.consensus_v0", "khop_env.formation_v0", "khop_env.leader_following_v0"],
+    ["khop_env.typed"],
     ["khop_env.testing"],
     ["khop_env.results"],
     ["agents"],

@@ -9,13 +9,15 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def test_the_readmes_python_runs(capsys):
+def test_the_readmes_python_runs(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # one snippet writes below runs/
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
     said = []
     for snippet in snippets:
+        snippet = snippet.replace("learn(1_000_000)", "learn(10_000)")  # 20 s of training are too long here
         exec(compile(snippet, "README.md", "exec"), {})
         said.append(capsys.readouterr().out)
-    assert len(snippets) == 4
+    assert len(snippets) == 5
     assert all(said)
     assert "largest |xi| / rho: 0." in said[-1]
 

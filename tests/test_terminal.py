@@ -1,6 +1,12 @@
 """What the command line shows, apart from any command."""
 
+import contextlib
+import io
+from collections import Counter
+
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from khop_env import terminal
 
@@ -42,3 +48,28 @@ class TestProgress:
 )
 def test_a_ratio_is_never_rounded_to_1(value, expected):
     assert terminal._ratio(value) == expected
+
+
+@given(st.data(), st.integers(20, 120))
+def test_tables_fold_columns_and_never_words(data, width):
+    """And they are as wide as asked for, wherever their longest words let them."""
+    word = st.text("abcdef(/)=", min_size=1, max_size=14)
+    cell = st.lists(word, max_size=3).map(" ".join)
+    count = data.draw(st.integers(1, 8))
+    header = data.draw(st.lists(st.lists(word, min_size=1, max_size=2).map(" ".join), min_size=count, max_size=count))
+    rows = data.draw(st.lists(st.lists(cell, min_size=count, max_size=count), min_size=1, max_size=4))
+    whole = data.draw(st.lists(st.sampled_from(header), max_size=2))
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        terminal.print_table(header, rows, width=width, whole=whole)
+    found = out.getvalue()
+    columns = [[name, *(row[number] for row in rows)] for number, name in enumerate(header)]
+    assert Counter(found.split()) - Counter({"─": 1}) >= Counter(
+        word for cells in columns for text in cells for word in text.split()
+    )
+    least = [
+        max(len(text) if name in whole else max(map(len, text.split()), default=0) for text in cells)
+        for name, cells in zip(header, columns, strict=True)
+    ]
+    longest = max(len(line.rstrip()) for line in found.splitlines())
+    assert longest <= max(width, sum(least) + 2 * (count - 1))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from agents.learning.fingerprint import plain
 from khop_env.registry import Environment, find_task
 from khop_env.scenarios import Scenario
 from khop_env.simulation import OBSERVE, Observe
@@ -21,28 +23,29 @@ class TrainingConfig:
     """All settings of a training run; the defaults work for every task of the library.
 
     Attributes:
-        environment: one of `khop_env.environments()`, or a task of your own.
-        scenario: name, path or `Scenario`; None for the environment's default.
-        observe: "estimate", "oracle" or "local".
-        bounds: whether observations include the guaranteed bounds.
-        rates: whether features include rates of change of positions, as differences of observations.
-        algorithm: "ppo" or "sac".
-        per_type: whether each agent type has its own network; by default all agents share one.
-        timesteps: agent-steps, summed over all environments.
-        seed: seed of networks, environments and exploration.
-        num_envs: number of environments, each with N agents.
-        hidden: widths of the hidden layers.
-        learning_rate: initial learning rate; decreases linearly to 0 with "ppo".
-        gamma: discount per control period.
-        gae_lambda: lambda of generalised advantage estimation; PPO.
+        environment: name of an environment (khop list), or a task of your own.
+        scenario: what `khop_env.scenario` takes, or a `Scenario`; None for the environment's own.
+        observe: states of agents beyond the neighbours: "estimate", "oracle" or "local".
+        bounds: whether observations hold the guaranteed bounds.
+        rates: whether networks get how fast positions change, too, as differences of observations.
+        algorithm: learning algorithm, "ppo" or "sac".
+        per_type: a network for each type of agent instead of one for all.
+        timesteps: agent-steps in all, of all copies together.
+        seed: seed of networks, episodes and exploration.
+        num_envs: copies of the environment, each of N agents.
+        hidden: widths of the networks' layers.
+        learning_rate: learning rate at the beginning; falls linearly to 0 with "ppo".
+        gamma: discount per control period, from 0 to 1.
+        gae_lambda: lambda of the generalised advantage estimates, from 0 to 1; PPO.
         n_steps: control periods between updates; PPO.
-        batch_size: samples per gradient step.
-        n_epochs: passes over the samples per update; PPO.
-        clip_range: clip range of the probability ratio; PPO.
+        batch_size: samples in a gradient step.
+        n_epochs: passes over the samples of an update; PPO.
+        clip_range: how far an update may change the probability of an action, as a fraction; PPO.
         entropy: weight of the entropy bonus; PPO.
         log_std: logarithm of the initial standard deviation of actions; PPO.
-        huber: task error in m above which the training reward is linear in it; evaluation stays quadratic.
-        evaluations: number of evaluations on fixed seeds; the policy is saved at each.
+        huber: task error, in its unit, from which the training reward is linear in it; evaluation stays quadratic.
+        evaluations: how often the policy is evaluated on fixed seeds, and saved.
+        arguments: further arguments of the environment by name, e.g. {"control_period": 0.1, "reward": "team"}.
 
     Raises:
         ValueError: if a value is invalid; the message names the attribute, the value and what is expected.
@@ -70,9 +73,14 @@ class TrainingConfig:
     log_std: float = 0.5
     huber: float = 1.0
     evaluations: int = 20
+    arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
+        object.__setattr__(self, "arguments", dict(self.arguments))
+        for name in ("observe", "bounds", "num_envs", "scenario"):
+            if name in self.arguments:
+                raise ValueError(f"arguments: {name!r} is a setting of its own, {name}={self.arguments[name]!r}")
         if self.algorithm not in ALGORITHMS:
             raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
         if self.observe not in OBSERVE:
@@ -103,4 +111,5 @@ class TrainingConfig:
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         name = self.scenario.name if isinstance(self.scenario, Scenario) else self.scenario and str(self.scenario)
         environment = self.environment if isinstance(self.environment, str) else find_task(self.environment).name
-        return {**values, "environment": environment, "scenario": name, "hidden": list(self.hidden)}
+        changed = {"environment": environment, "scenario": name, "hidden": list(self.hidden)}
+        return {**values, **changed, "arguments": plain(self.arguments)}

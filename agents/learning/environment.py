@@ -26,11 +26,12 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
         num_envs: number of environments; by default that of the run.
 
     Raises:
-        ValueError: if environment or scenario is unknown.
+        ValueError: if environment, scenario or an argument of the environment is unknown or invalid.
     """
     where = {} if config.scenario is None else {"scenario": config.scenario}
     count = config.num_envs if num_envs is None else num_envs
-    return make_batched(config.environment, **where, num_envs=count, observe=config.observe, bounds=config.bounds)
+    of_config: dict[str, Any] = {"observe": config.observe, "bounds": config.bounds}
+    return make_batched(config.environment, **where, num_envs=count, **of_config, **config.arguments)
 
 
 class TrainingVecEnv(VecEnvWrapper):

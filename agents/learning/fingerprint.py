@@ -27,8 +27,8 @@ def fingerprint(scenario: Scenario, env: BatchedEnv) -> dict[str, Any]:
     parts = {field.name: getattr(scenario, field.name) for field in dataclasses.fields(scenario)}
     return {
         "task": {**env.task.signature(env.world), **_parameters(env.task)},
-        "scenario": _plain({name: value for name, value in parts.items() if name not in _IRRELEVANT}),
-        "settings": _plain(env.settings),
+        "scenario": plain({name: value for name, value in parts.items() if name not in _IRRELEVANT}),
+        "settings": plain(env.settings),
         "observation": [layout.names for layout in env.layouts[:1]],
     }
 
@@ -36,7 +36,7 @@ def fingerprint(scenario: Scenario, env: BatchedEnv) -> dict[str, Any]:
 def _parameters(task: Task) -> dict[str, Any]:
     """The arguments of a task that is a dataclass."""
     fields: tuple[Any, ...] = dataclasses.fields(task) if dataclasses.is_dataclass(task) else ()
-    return {each.name: _plain(getattr(task, each.name)) for each in fields if each.init}
+    return {each.name: plain(getattr(task, each.name)) for each in fields if each.init}
 
 
 def differences(saved: Any, current: Any) -> str:
@@ -63,16 +63,16 @@ def _short(value: Any) -> str:
     return repr(value)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Convert to mappings, lists and plain values; an object becomes its type and attributes."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, nx.Graph):
         return sorted(sorted(edge) for edge in value.edges)
     if callable(value) and hasattr(value, "__qualname__"):
@@ -81,4 +81,4 @@ def _plain(value: Any) -> Any:
         parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     else:
         parts = {name: item for name, item in getattr(value, "__dict__", {}).items() if not name.startswith("_")}
-    return {"type": type(value).__name__, **{name: _plain(item) for name, item in parts.items()}}
+    return {"type": type(value).__name__, **{name: plain(item) for name, item in parts.items()}}

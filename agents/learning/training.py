@@ -26,6 +26,7 @@ import khop_env
 from agents.evaluation import chosen_scenario, play
 from agents.learning.checkpoint import CheckpointError, model_state, restore_model, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
+from agents.learning.config_file import write_config
 from agents.learning.environment import TrainingVecEnv, build, training_environment
 from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.learned import LearnedPolicy, columns_of
@@ -51,7 +52,7 @@ class Evaluation:
     Attributes:
         timesteps: agent-steps so far.
         mean_return: over the evaluation episodes.
-        final_task_error: mean over the agents and episodes at the end, in m.
+        final_task_error: mean over the agents and episodes at the end, in the task's unit.
         max_normalized_disagreement: largest |xi| / rho in the episodes.
     """
 
@@ -87,11 +88,11 @@ def train(
 ) -> Training:
     """Train a policy.
 
-    The folder gets config.json (settings and library versions), curve.csv, best.npz and last.npz (policies with their
-    observation scales), checkpoint.npz (everything needed to resume) and TensorBoard logs. A keyboard interrupt saves
-    and returns. A resumed run continues as if it had not been interrupted, bit for bit with PPO; SAC begins with an
-    empty replay buffer. With more `timesteps` than before, a run continues beyond its end; PPO's learning rate then
-    follows the schedule of the longer run.
+    The folder gets config.toml (every setting, as `khop train --config` takes it), config.json (the same and library
+    versions), curve.csv, best.npz and last.npz (policies with their observation scales), checkpoint.npz (everything
+    needed to resume) and TensorBoard logs. A keyboard interrupt saves and returns. A resumed run continues as if it had
+    not been interrupted, bit for bit with PPO; SAC begins with an empty replay buffer. With more `timesteps` than
+    before, a run continues beyond its end; PPO's learning rate then follows the schedule of the longer run.
 
     Args:
         config: settings; with `resume` they must equal those of the folder, except that `timesteps` may be larger.
@@ -107,17 +108,17 @@ def train(
     """
     torch.set_num_threads(1)  # small networks don't gain from more
     folder = None if out is None else Path(out)
-    config = dataclasses.replace(config, scenario=chosen_scenario(config.environment, config.scenario))
+    asked, config = config, dataclasses.replace(config, scenario=chosen_scenario(config.environment, config.scenario))
     if folder is None or not (folder / CHECKPOINT).exists():
         if resume:
             raise FileNotFoundError(f"nothing to resume: there is no {CHECKPOINT} in {folder}")
         if folder is None:
-            return _Run(config, None, None, on_progress).learn()
+            return _Run(config, None, None, on_progress, asked).learn()
     with alone_in(folder):
         saved = load_checkpoint(folder, config) if resume else None
         if not resume and any((folder / name).exists() for name in (CHECKPOINT, "best.npz")):
             raise FileExistsError(f"{folder} holds a training run; continue it with --resume, or choose another folder")
-        return _Run(config, folder, saved, on_progress).learn()
+        return _Run(config, folder, saved, on_progress, asked).learn()
 
 
 class _StopError(Exception):
@@ -133,8 +134,10 @@ class _Run(BaseCallback):
         folder: Path | None,
         saved: Mapping[str, Any] | None,
         on_progress: OnProgress | None,
+        asked: TrainingConfig,
     ) -> None:
         super().__init__()
+        self.asked = asked  # with the scenario as the user names it
         self.config, self.folder, self.on_progress = config, folder, on_progress
         self.env: VecNormalize = training_environment(config)
         self.learner: TrainingVecEnv = self.env.venv  # type: ignore[assignment]
@@ -281,6 +284,7 @@ class _Run(BaseCallback):
     def _write_config(self, folder: Path) -> None:
         text = {**self.config.as_dict(), "versions": _versions(), "agents": len(self.batched.agents)}
         write(folder / "config.json", json.dumps(text, indent=2) + "\n")
+        write(folder / "config.toml", write_config(self.asked, _versions()))
 
     def _checkpoint(self) -> dict[str, Any]:
         """Everything that the next update depends on, for `write_checkpoint`."""

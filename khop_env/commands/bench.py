@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from khop_env.commands.common import JsonOption, mistakes, print_json
-from khop_env.terminal import print_table, say
+from khop_env.terminal import print_table, print_text, say
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
@@ -19,14 +19,15 @@ INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes, rougher numbers.")] = False,
     peers: Annotated[
-        Path | None, typer.Option(help="Folder with virtual environments mpe2, vmas, jaxmarl to compare with.")
+        Path | None,
+        typer.Option(help="Folder of virtual environments (mpe2, vmas, jaxmarl) with libraries to compare with."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure speed and memory against explicit, SciPy's and bare loops, and other libraries' environments.
 
-    It runs in a clone of the repository. Exit status 2 if a part failed, and 130 after Ctrl-C; what was measured is
-    printed all the same.
+    It runs in a clone of the repository. Exits with 2 if a part failed, and with 130 after Ctrl-C; the other rows are
+    printed.
     """
     with mistakes():
         result = _benchmark()(quick=quick, progress=say, peers=peers)
@@ -37,10 +38,10 @@ def bench(
         print_table(("measure", "value", "unit", "target"), rows)
         for reason in dict.fromkeys(row["skipped"] for row in result["rows"] if row["skipped"] is not None):
             names = ", ".join(row["name"] for row in result["rows"] if row["skipped"] == reason)
-            typer.echo(f"skipped: {names}: {reason}")
-        typer.echo(f"machine: {result['machine']}")
+            print_text(f"skipped: {names}: {reason}")
+        print_text(f"machine: {result['machine']}")
     if result["interrupted"]:
-        say("khop: interrupted; what is missing wasn't measured")
+        say("khop: interrupted; the rows that are missing weren't measured")
         raise typer.Exit(INTERRUPTED)
     if result["failed"]:
         raise typer.Exit(2)

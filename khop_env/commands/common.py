@@ -1,10 +1,9 @@
-"""What the commands share: options, how mistakes are told, and how scenarios are found."""
+"""Shared by the commands: options, the handling of mistakes, and how names become scenarios and tasks."""
 
 from __future__ import annotations
 
 import enum
 import json
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +14,7 @@ from khop_env.terminal import say
 
 if TYPE_CHECKING:
     from khop_env.scenarios import Scenario
+    from khop_env.tasks import Task
 
 
 INTERRUPTED = 130
@@ -22,7 +22,7 @@ INTERRUPTED = 130
 
 
 class ObserveOption(enum.StrEnum):
-    """What the law sees of agents out of earshot."""
+    """Source of the states of agents beyond the neighbours."""
 
     ESTIMATE = "estimate"
     ORACLE = "oracle"
@@ -33,7 +33,31 @@ ScenarioArgument = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="A name (khop list), one with parameters (random_geometric:agents=100,k=2), or the path of a .toml file.",
+        help="A name (khop list), with parameters (random_geometric:agents=100,k=2); a .toml file; or a Python object "
+        "or function, my_file.py:my_scenario or my_module:my_scenario.",
+    ),
+]
+EnvironmentArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="ENV", help="A name (khop list), or a task of your own: my_file.py:MyTask or my_module:MyTask."
+    ),
+]
+EnvironmentScenario = Annotated[
+    str | None,
+    typer.Option(
+        "--scenario",
+        help="A scenario's name, .toml file, or Python object (my_file.py:my_scenario); by default the environment's "
+        "own.",
+    ),
+]
+EnvOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--env",
+        metavar="NAME=VALUE",
+        help="An argument of the environment: control_period=0.1, reward=team, leaders=drifter_0+drifter_3; "
+        "repeatable.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -41,7 +65,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.
 
 @contextmanager
 def mistakes(name: str | None = None) -> Iterator[None]:
-    """Tell of a mistake in what was asked in one paragraph, without a traceback; `name` is the scenario's."""
+    """Report a mistake of the user's in one paragraph, without a traceback; `name` is the scenario's."""
     try:
         yield
     except MemoryError as error:
@@ -56,7 +80,7 @@ def mistakes(name: str | None = None) -> Iterator[None]:
 
 
 def in_words_of_the_file(name: str, message: str) -> str:
-    """What is wrong with a design, as one who edits a scenario file knows it; unchanged for scenarios by name."""
+    """A design's error in the words of a scenario file; unchanged for scenarios by name."""
     if not name.endswith(".toml"):
         return message
     for value in ("True", "False"):
@@ -64,16 +88,11 @@ def in_words_of_the_file(name: str, message: str) -> str:
     return f"{name}: {message}"
 
 
-def folder_name(scenario_name: str) -> str:
-    """A scenario's name as that of one visible folder."""
-    return re.sub(r"[^\w.-]+", "_", scenario_name).lstrip(".") or "scenario"
-
-
 def load(name: str) -> Scenario:
     """The scenario that the user names, whose law exists.
 
     Raises:
-        ValueError: if there is no such scenario, file or law.
+        ValueError: if there is no such scenario, file, object or law.
     """
     from agents.laws import LAWS, LawError, make_law
     from khop_env.registry import scenario
@@ -86,6 +105,26 @@ def load(name: str) -> Scenario:
         key = "law" if error.parameter is None else f"law.{error.parameter}"
         raise ValueError(f"{name}: {key}: {error}") from error
     return found
+
+
+def find_environment(name: str) -> Task | type[Task] | None:
+    """The task that a name of an environment, or of a Python object, stands for; None where it is no such name.
+
+    Raises:
+        ValueError: if a Python object is named that can't be found.
+    """
+    from khop_env.objects import is_object_name, load_object
+    from khop_env.registry import SCENARIOS, environments, find_task
+    from khop_env.tasks import Task
+
+    if name in environments():
+        return find_task(name)
+    if name.partition(":")[0] in SCENARIOS or not is_object_name(name):
+        return None
+    found = load_object(name)
+    return (
+        find_task(found) if isinstance(found, Task) or (isinstance(found, type) and issubclass(found, Task)) else None
+    )
 
 
 def print_json(value: Any) -> None:

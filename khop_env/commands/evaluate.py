@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from khop_env.commands.common import INTERRUPTED, JsonOption, mistakes, print_json
-from khop_env.terminal import Progress, print_table, say, waiting
+from khop_env.commands.common import (
+    INTERRUPTED,
+    EnvironmentArgument,
+    EnvironmentScenario,
+    EnvOption,
+    JsonOption,
+    load,
+    mistakes,
+    print_json,
+)
+from khop_env.terminal import Progress, print_table, print_text, say, waiting
 
 if TYPE_CHECKING:
     from agents.comparison import Comparison
 
-EnvironmentArgument = Annotated[str, typer.Argument(metavar="ENV", help="One of those that khop list names.")]
-EnvironmentScenario = Annotated[
-    str | None, typer.Option("--scenario", help="As for khop run; by default the environment's own.")
-]
+_LONGEST_NAME = 18  # characters of a policy in the table; longer names are folded
 
 
 def evaluate(
@@ -26,24 +33,30 @@ def evaluate(
         str,
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
-            "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones: ppo:FOLDER, ppo:pretrained."
+            "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
+            "classes of your own, my_file.py:MyPolicy."
         ),
     ] = "tanh,linear,zero,random",
-    observe: Annotated[str, typer.Option(help="Observation modes: estimate, oracle, local.")] = "estimate,oracle,local",
-    episodes: Annotated[int, typer.Option(min=1, help="Of each row, the same for all.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first episode.")] = 0,
+    observe: Annotated[
+        str, typer.Option(help="Observation modes: estimate, oracle (true states), local (neighbours only).")
+    ] = "estimate,oracle,local",
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each row, the same for all.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
+    env: EnvOption = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; the numbers don't depend on how many.")] = 1,
     ray: Annotated[bool, typer.Option("--ray", help="Play on a Ray cluster.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Draw the task error over time into this image file.")] = None,
     csv: Annotated[bool, typer.Option("--csv", help="Print a line per episode instead of the table.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Play policies over the same episodes, and print what they return and how well they do.
+    """Play policies over the same episodes, and print a table of their returns and errors.
 
-    Where it is interrupted, or a worker or policy fails, what was played until then is printed all the same.
+    After an interrupt, or if a worker or policy fails, the rows played until then are printed.
     """
     from agents.comparison import compare
     from agents.workers import Interrupted, UnfinishedError
+    from khop_env.registry import find_task
+    from khop_env.typed import environment_arguments
 
     unfinished: tuple[str, int] | None = None  # why, and the exit status
     with mistakes():
@@ -53,13 +66,16 @@ def evaluate(
             if figure.suffix.lower() not in (".png", ".pdf", ".svg"):
                 raise ValueError(f"--figure {figure}: a figure's name ends in .png, .pdf or .svg")
             figure.parent.mkdir(parents=True, exist_ok=True)  # before anything is played that could be lost
+        arguments = environment_arguments(env, find_task(environment), {"observe": "--observe"})
+        chosen = None if scenario is None else load(scenario)
         with Progress(f"playing {environment}") as progress:
             try:
                 comparison = compare(
                     environment,
                     split_policies(policies),
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
-                    scenario=scenario,
+                    scenario=chosen,
+                    arguments=arguments,
                     seeds=range(seed, seed + episodes),
                     workers=workers,
                     ray=ray,
@@ -75,7 +91,7 @@ def evaluate(
             _draw(comparison, figure)
     if unfinished is not None:
         why, status = unfinished
-        say(f"khop: {why}; {'above is what' if comparison.rows else 'nothing'} was played until then")
+        say(f"khop: {why}; {'above are the episodes that were' if comparison.rows else 'none was'} played until then")
         raise typer.Exit(status)
 
 
@@ -97,12 +113,12 @@ def _draw(comparison: Comparison, figure: Path) -> None:
         f"{comparison.environment} on {comparison.scenario}: median and middle half of {comparison.planned} episodes"
     )
     with mistakes(), waiting(f"drawing {figure}"):
-        error_over_time(first.time, errors, figure, title)
+        error_over_time(first.time, errors, figure, title, comparison.rows[0].env.error_unit)
     say(f"figure: {figure}")
 
 
 def split_policies(text: str) -> list[str]:
-    """Policies from "tanh,linear:gain=2,cancel_drift=true": what only sets a parameter belongs to the one before.
+    """Policies from "tanh,linear:gain=2,cancel_drift=true": a further parameter belongs to the policy before it.
 
     Raises:
         ValueError: for no policy, or one named twice.
@@ -129,10 +145,10 @@ def print_comparison(comparison: Comparison) -> None:
         more, interval = comparison.difference(row)
         settling = seen["settling_time"]
         count = len(row.episodes.seed)
+        few = "" if count == comparison.planned else f" ({count} episodes)"
         rows.append(
             (
-                row.policy if count == comparison.planned else f"{row.policy} ({count} episodes)",
-                row.observe,
+                f"{_folded(row.policy)} on {row.observe}{few}",
                 _with_interval(seen["mean_return"], seen["ci95"]),
                 _with_interval(more, interval, sign="+") if number else "",
                 f"{seen['final_task_error']:.3g}",
@@ -142,27 +158,29 @@ def print_comparison(comparison: Comparison) -> None:
                 f"{seen['max_error_to_bound']:.3f}",
             )
         )
-    header = (
-        "policy",
-        "observe",
-        "return",
-        "to first row",
-        "error (m)",
-        "settled (s)",
-        "effort",
-        "|e| max",
-        "error/bound",
-    )
+    unit = comparison.rows[0].env.error_unit
+    header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", "|e|", "e / bound")
     title = f"{comparison.environment} on {comparison.scenario}, {comparison.planned} episodes, the same for every row"
     print_table(header, rows, title)
-    typer.echo(
-        "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; error: task\n"
-        "error at the end; settled: median time from which the team's error stays below a tenth of the initial one;\n"
-        "|e| and error/bound: largest of all observers, below 1 by guarantee"
+    print_text(
+        "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
+        "mean over agents and episodes, at the end; settled: median time from which the team's mean task error stays "
+        "below a tenth of the initial one; effort: mean |u|^2, u in fractions of the limits; |e|: largest |xi| / rho; "
+        "e / bound: largest estimation error over its bound (of all observers, below 1 by guarantee)"
     )
+
+
+def _folded(policy: str) -> str:
+    """A long name in several lines, which end at its own separators."""
+    lines = [""]
+    for piece in re.split(r"(?<=[/:,@-])", policy):
+        if lines[-1] and len(lines[-1]) + len(piece) > _LONGEST_NAME:
+            lines.append("")
+        lines[-1] += piece
+    return "\n".join(lines)
 
 
 def _with_interval(value: float, interval: float | None, sign: str = "") -> str:
     digits = 3 if abs(value) < 10 else 2 if abs(value) < 1000 else 1
     text = f"{value:{sign}.{digits}f}"
-    return text if interval is None else f"{text} ± {interval:.{digits}f}"
+    return text if interval is None else f"{text} ±{interval:.{digits}f}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,26 +13,30 @@ from khop_env.commands.common import (
     INTERRUPTED,
     JsonOption,
     ScenarioArgument,
-    folder_name,
     load,
     mistakes,
     print_json,
 )
-from khop_env.terminal import Progress, print_table, say, waiting
+from khop_env.commands.folders import SUMMARY, choose_folder, digest, folder_name, sources
+from khop_env.terminal import Progress, print_table, print_text, say, waiting
 
 
 def iss(
     name: ScenarioArgument,
-    episodes: Annotated[int, typer.Option(min=1, help="Of each row.")] = 16,
-    seed: Annotated[int, typer.Option(min=0, help="Of initial states, errors and disturbances.")] = 0,
-    duration: Annotated[float | None, typer.Option(help="Of a run in seconds; by default the scenario's.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the files; by default runs/iss/SCENARIO.")] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes in each row.")] = 16,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of initial states, errors and disturbances.")] = 0,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of an episode in seconds; by default the scenario's.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the files; by default as runs/iss/paper-tanh-seed0.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure Theorem 4: how near to its goal the team comes with errors of a given size, and with tighter bounds.
+    """Measure Theorem 4: the team's distance to its goal under errors of a given size, and with tighter bounds.
 
-    Exits with 1 if a run came out farther than the analytical gain allows. Where it is interrupted, what was measured
-    until then is written and printed all the same, but for the figure.
+    Exits with 1 if a run ended farther away than the analytical gain allows. After an interrupt, the rows measured so
+    far are written and printed, without the figure.
     """
     import polars as pl
 
@@ -44,10 +49,14 @@ def iss(
         if duration is not None:
             scenario = scenario.replace(duration=duration)
         gain = analytical_gain(scenario)
-        folder = out or Path("runs") / "iss" / folder_name(scenario.name)
-        folder.mkdir(parents=True, exist_ok=True)
+        configuration: dict[str, Any] = {"scenario": scenario.name, "law": scenario.law.name, "episodes": episodes}
+        configuration |= {"seed": seed, "duration": scenario.duration}
+        configuration["scenario_content"] = digest(scenario, sources(scenario.models))
+        default = Path("runs") / "iss" / folder_name(scenario.name, scenario.law.name, f"seed{seed}")
+        folder = choose_folder(default, out, configuration)
     measured: dict[str, list[dict[str, Any]]] = {"injected": [], "swept": []}
     unfinished: tuple[str, int] | None = None  # why, and the exit status
+    unit = scenario.fleet.position_unit()
     with mistakes(name):
         try:
             with Progress("injecting errors") as progress:
@@ -67,57 +76,61 @@ def iss(
                 title = (
                     f"{scenario.name}, law {scenario.law.name}: set-ISS with respect to estimation errors (Theorem 4)"
                 )
-                set_iss_figure(injected, swept, files["figure"], title)
+                set_iss_figure(injected, swept, files["figure"], title, unit)
     slopes = [
         {
             "observers": kind,
             "disturbed": disturbed,
-            "slope": slope(mine, "delta", "excess" if disturbed else "distance"),
+            "slope": slope(chosen, "delta", "excess" if disturbed else "distance"),
         }
         for kind, disturbed in dict.fromkeys((row["observers"], row["disturbed"]) for row in swept)
-        for mine in [[row for row in swept if (row["observers"], row["disturbed"]) == (kind, disturbed)]]
+        for chosen in [[row for row in swept if (row["observers"], row["disturbed"]) == (kind, disturbed)]]
     ]
     verdicts = [row["holds"] for row in (*injected, *swept) if row["holds"] is not None]
-    broken = [one for one in verdicts if not one]
+    broken = verdicts.count(False)
+    region = None if gain is None else gain.region()
+    found: dict[str, Any] = {"scenario": scenario.name, "law": scenario.law.name, "analytical_region": region}
+    found |= {"position_unit": unit, "holds": all(verdicts) if verdicts else None}
+    found |= {"injected": injected, "swept": swept, "slopes": slopes, "configuration": configuration}
+    with mistakes():
+        (folder / SUMMARY).write_text(json.dumps(found, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    files["summary"] = folder / SUMMARY
     if as_json:
-        region = None if gain is None else gain.region()
-        found: dict[str, Any] = {"scenario": scenario.name, "law": scenario.law.name, "analytical_region": region}
-        found["holds"] = all(verdicts) if verdicts else None
-        found |= {"injected": injected, "swept": swept, "slopes": slopes}
         print_json({**found, "files": {key: str(path) for key, path in files.items()}})
     else:
-        _print_tables(injected, swept, slopes)
+        _print_tables(injected, swept, slopes, unit)
         if gain is None:
             typer.echo("analytical gain: none for this law and scenario; measured only")
         else:
             checked = sum(row["holds"] is not None for row in (*injected, *swept))
-            verdict = f"{len(broken)} exceed it" if broken else "none exceeds it"
-            typer.echo(
-                f"analytical gain: for distances up to {gain.region():.3g} m; it says something of {checked} of "
+            verdict = f"{broken} exceed it" if broken else "none exceeds it"
+            print_text(
+                f"analytical gain: for distances up to {region:.3g} {unit}; it says something of {checked} of "
                 f"{len(injected) + len(swept)} rows, and {verdict}"
             )
-        if tables := [str(files[key]) for key in ("injected", "swept") if key in files]:
-            typer.echo(f"tables: {', '.join(tables)}")
-        if "figure" in files:
-            typer.echo(f"figure: {files['figure']}")
+        for key, path in files.items():
+            typer.echo(f"{key}: {path}")
     if unfinished is not None:
         why, status = unfinished
-        say(f"khop: {why}; above is what was measured until then")
+        say(f"khop: {why}; above are the rows that were measured until then")
         raise typer.Exit(status)
     if broken:
         raise typer.Exit(1)
 
 
 def _print_tables(
-    injected: Sequence[Mapping[str, Any]], swept: Sequence[Mapping[str, Any]], slopes: Sequence[Mapping[str, Any]]
+    injected: Sequence[Mapping[str, Any]],
+    swept: Sequence[Mapping[str, Any]],
+    slopes: Sequence[Mapping[str, Any]],
+    unit: str,
 ) -> None:
     print_table(
-        ("error (m)", "pattern", "distance (m)", "gain", "allowed (m)"),
+        (f"error ({unit})", "pattern", f"distance ({unit})", "gain", f"allowed ({unit})"),
         [
             (_n(row["error"]), row["pattern"], *(_n(row[key]) for key in ("distance", "gain", "bound")))
             for row in injected
         ],
-        "(a) The law on the truth plus errors, no disturbance: ultimate distance to the goal set",
+        "(a) The law on true states plus errors, no disturbance: distance to the goal set",
     )
     if not swept:  # it was interrupted before
         return
@@ -128,20 +141,23 @@ def _print_tables(
             "observers",
             "disturbed",
             "delta(inf)",
-            "errors (m)",
-            "oracle (m)",
-            "distance (m)",
-            "excess (m)",
-            "allowed (m)",
+            f"errors ({unit})",
+            f"oracle ({unit})",
+            f"distance ({unit})",
+            f"excess ({unit})",
+            f"allowed ({unit})",
         ),
         [(row["observers"], "yes" if row["disturbed"] else "no", *(_n(row[key]) for key in keys)) for row in swept],
-        "(b) The law on estimates, paired with the law on the truth (oracle) after the transient",
+        "(b) The law on estimates, paired with the law on true states (oracle)",
     )
-    typer.echo("allowed: on the distance, by the analytical gain, from the errors and the disturbances along the runs")
+    print_text(
+        "distances: largest |Pi p| (all positions together, from their mean) in the last quarter of an episode; "
+        "allowed: on the distance, by the analytical gain, from the errors and the disturbances along the runs"
+    )
     for row in slopes:
         what = "excess with disturbance" if row["disturbed"] else "distance without disturbance"
         text = "none: it is down at rounding" if row["slope"] is None else f"{row['slope']:.2f}"
-        typer.echo(f"slope of log {what} over log delta(inf), observers {row['observers']}: {text}")
+        print_text(f"slope of log {what} over log delta(inf), observers {row['observers']}: {text}")
 
 
 def _n(value: float | None) -> str:

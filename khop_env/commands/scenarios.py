@@ -1,4 +1,4 @@
-"""`khop list`, `check` and `export`: what scenarios and environments there are, and what they rest on."""
+"""`khop list`, `check` and `export`: the scenarios and environments, and the conditions of a scenario's observers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from khop_env.terminal import print_table, print_text, waiting
 
 
 def list_scenarios(as_json: JsonOption = False) -> None:
-    """List the scenarios, with one line each, and the environments, which run on all of them."""
+    """List the scenarios, a line each, and the environments, which run on all of them."""
     from khop_env.registry import describe, environments
 
     found = describe()
@@ -17,18 +17,21 @@ def list_scenarios(as_json: JsonOption = False) -> None:
         print_json({"scenarios": found, "environments": environments()})
         return
     print_table(
-        ("scenario", "parameters", "what it is"),
+        ("scenario", "parameters", "description"),
         [
-            (one["name"], ", ".join(f"{key}={value}" for key, value in one["parameters"].items()), one["description"])
-            for one in found
+            (
+                each["name"],
+                ", ".join(f"{key}={value}" for key, value in each["parameters"].items()),
+                each["description"],
+            )
+            for each in found
         ],
-        width=80,
     )
     print_text(f"environments: {', '.join(environments())}")
 
 
 def check(name: ScenarioArgument, as_json: JsonOption = False) -> None:
-    """Report what the observers rest on: k-hop sets, funnels, feasibility, the paper's assumptions.
+    """Report the design of a scenario's observers: k-hop sets, funnels, feasibility, the paper's assumptions.
 
     Exits with 1 if a condition of the observers doesn't hold.
     """

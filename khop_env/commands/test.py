@@ -1,4 +1,4 @@
-"""`khop test`: the contract of the environments, held against anybody's."""
+"""`khop test`: the contract of the environments, checked on any environment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from khop_env.commands.common import JsonOption, mistakes, print_json
+from khop_env.commands.common import EnvironmentScenario, JsonOption, load, mistakes, print_json
 from khop_env.terminal import Progress
 
 
@@ -20,13 +20,13 @@ def contract(
         str,
         typer.Argument(
             metavar="ENV",
-            help="A name (khop list); a module with parallel_env, as mpe2.simple_spread_v3; or an environment, or what "
-            "makes one, as my_module:make_env or my_file.py:make_env.",
+            help="A name (khop list); a module with parallel_env, as mpe2.simple_spread_v3; or a Python object: an "
+            "environment, a function that returns one, or a task: my_module:make_env, my_file.py:MyTask.",
         ),
     ],
-    scenario: Annotated[str | None, typer.Option("--scenario", help="Of a named environment: as for khop run.")] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Of an episode, and of comparisons.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="The first one.")] = 0,
+    scenario: EnvironmentScenario = None,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of an episode, and of comparisons.")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="First seed.")] = 0,
     skip: Annotated[str, typer.Option(help="Checks to leave out: other_seed,unseeded")] = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -51,18 +51,18 @@ def contract(
 
 
 def _maker(name: str, scenario: str | None) -> tuple[Callable[[], Any] | Any, str]:
-    """An environment or what makes it, tried once, so that its own mistakes are told as such.
+    """An environment, or a function that makes it and was tried once, so that its own mistakes are named.
 
     Raises:
         ValueError: if there is none of that name, or if making it raises.
     """
-    from khop_env.objects import described, load_object
+    from khop_env.objects import called, load_object
     from khop_env.physics import did_you_mean
     from khop_env.registry import environments, make
     from khop_env.tasks import Task
 
     if name in environments():
-        return partial(make, name, scenario), name
+        return partial(make, name, scenario and load(scenario)), name
     try:
         found = load_object(name)
     except ValueError as error:
@@ -70,14 +70,10 @@ def _maker(name: str, scenario: str | None) -> tuple[Callable[[], Any] | Any, st
             raise
         raise ValueError(f"no environment {name!r}; {did_you_mean(name, environments())} And {error}") from error
     if isinstance(found, Task) or (isinstance(found, type) and issubclass(found, Task)):
-        return partial(make, found, scenario), name
+        return partial(make, found, scenario and load(scenario)), name
     if scenario is not None:
         raise ValueError(f"--scenario is for environments that khop list names and for tasks; {name} has its own")
     found = getattr(found, "parallel_env", found)
     if callable(found):
-        try:
-            found()
-        except Exception as error:
-            file = getattr(sys.modules.get(found.__module__), "__file__", None) or ""
-            raise ValueError(f"{name} raised {described(error, file)}") from error
+        called(name, found)
     return found, name

@@ -2,78 +2,192 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
+import json
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from khop_env.commands.common import ObserveOption, folder_name, mistakes
-from khop_env.commands.evaluate import EnvironmentArgument, EnvironmentScenario
-from khop_env.terminal import Progress, say, waiting
+from khop_env.commands.common import (
+    EnvironmentScenario,
+    EnvOption,
+    JsonOption,
+    ObserveOption,
+    load,
+    mistakes,
+    print_json,
+)
+from khop_env.commands.folders import folder_name
+from khop_env.extras import how_to_install
+from khop_env.terminal import Progress, print_text, say, waiting
 
 if TYPE_CHECKING:
+    from agents.learning import TrainingConfig
     from agents.learning.training import Evaluation
+
+_OF_SAC = {"learning_rate": 1e-3, "batch_size": 512}  # where these settings aren't chosen
 
 
 class AlgorithmOption(enum.StrEnum):
-    """Who learns."""
+    """Learning algorithm."""
 
     PPO = "ppo"
     SAC = "sac"
 
 
 def train(
-    environment: EnvironmentArgument,
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[ENV]",
+            help="A name (khop list), or a task of your own: my_file.py:MyTask or my_module:MyTask. A --config file "
+            "can name it instead.",
+        ),
+    ] = None,
     scenario: EnvironmentScenario = None,
-    observe: Annotated[ObserveOption, typer.Option(help="What it learns on.")] = ObserveOption.ESTIMATE,
-    bounds: Annotated[bool, typer.Option("--bounds", help="Show it the guaranteed bounds of its estimates.")] = False,
-    algo: Annotated[AlgorithmOption, typer.Option(help="Algorithm.")] = AlgorithmOption.PPO,
-    per_type: Annotated[bool, typer.Option("--per-type", help="One network for each type of agent.")] = False,
-    timesteps: Annotated[int, typer.Option(min=1, help="Agent-steps in all.")] = 2_000_000,
-    seed: Annotated[int, typer.Option(min=0, help="Of networks, episodes and exploration.")] = 0,
-    num_envs: Annotated[int, typer.Option(min=1, help="Copies of the environment.")] = 64,
-    out: Annotated[Path | None, typer.Option(help="Folder; by default runs/train/ and what is trained.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the folder's checkpoint.")] = False,
+    observe: Annotated[
+        ObserveOption | None,
+        typer.Option(help="States of agents beyond the neighbours that it learns on; by default estimate."),
+    ] = None,
+    bounds: Annotated[
+        bool | None, typer.Option("--bounds", help="Add the guaranteed bounds of the estimates to its observations.")
+    ] = None,
+    algo: Annotated[AlgorithmOption | None, typer.Option(help="Algorithm; by default ppo.")] = None,
+    per_type: Annotated[bool | None, typer.Option("--per-type", help="One network for each type of agent.")] = None,
+    timesteps: Annotated[
+        int | None, typer.Option(min=1, help="Agent-steps of all copies together; by default 2000000.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of networks, episodes and exploration; by default 0.")
+    ] = None,
+    num_envs: Annotated[int | None, typer.Option(min=1, help="Copies of the environment; by default 64.")] = None,
+    env: EnvOption = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Any setting of a config file: learning_rate=1e-3, hidden=128+128; repeatable.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config",
+            help="TOML file of settings; each run's folder has one, config.toml. --set wins over it, and options win "
+            "over both.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder; by default in runs/train/, named after environment, algorithm and seed."),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the folder's last checkpoint.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Train a policy; then play it: khop evaluate ENV --policies ppo:FOLDER.
 
-    Ctrl-C saves the policy and ends. --resume goes on from the last checkpoint (there are twenty in a run) as if
-    nothing had happened; SAC begins with an empty replay buffer. With larger --timesteps a run goes on beyond its end;
-    where the scenario was edited, it doesn't.
+    Ctrl-C saves the policy and ends. --resume continues from the last of twenty checkpoints as if nothing had happened;
+    SAC begins with an empty replay buffer. With larger --timesteps a finished run continues; if its scenario was edited
+    since, it is refused.
     """
+    options = {
+        "environment": environment,
+        "scenario": scenario,
+        "observe": observe and observe.value,
+        "bounds": bounds,
+        "algorithm": algo and algo.value,
+        "per_type": per_type,
+        "timesteps": timesteps,
+        "seed": seed,
+        "num_envs": num_envs,
+    }
     with mistakes(), waiting("starting"):
         try:
             from agents.learning.training import train
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(f"training needs {error.name}: pip install 'khop_env[rl]'") from error
-        from agents.learning import TrainingConfig
+            raise ModuleNotFoundError(f"training needs {error.name}: {how_to_install('rl')}") from error
+        from agents.learning.environment import build
+        from agents.policy import describe
 
-        chosen: dict[str, Any] = {"observe": observe.value, "algorithm": algo.value, "bounds": bounds}
-        if algo is AlgorithmOption.SAC:
-            chosen |= {"learning_rate": 1e-3, "batch_size": 512}
-        config = TrainingConfig(
-            environment, scenario, per_type=per_type, timesteps=timesteps, seed=seed, num_envs=num_envs, **chosen
-        )
-        parts = (environment, scenario or "", observe.value, "bounds" * bounds, "per_type" * per_type, f"{algo}-{seed}")
-        folder = out or Path("runs") / "train" / folder_name("-".join(filter(None, parts)))
-    with mistakes(), Progress(f"training {environment} on {observe}") as progress:
+        set_by_options = {name: value for name, value in options.items() if value is not None}
+        chosen = _chosen(config, settings or [], set_by_options, env or [])
+        played = describe(build(chosen, 1))  # refuses what doesn't fit before there is a folder
+        unit = played.error_unit
+        folder = out or Path("runs") / "train" / _folder(chosen, played.environment)
+    label = f"training {chosen.environment} on {chosen.observe}"
+    with mistakes(), Progress(label) as progress:
 
-        def told(fraction: float, evaluation: Evaluation | None) -> None:
+        def report(fraction: float, evaluation: Evaluation | None) -> None:
             progress(fraction)
             if evaluation is not None:
                 progress.say(
-                    f"{evaluation.timesteps:>10,} agent-steps: return {evaluation.mean_return:8.3f}, task error at the "
-                    f"end {evaluation.final_task_error:.3f} m, largest |e| {evaluation.max_normalized_disagreement:.3f}"
+                    f"{evaluation.timesteps:>11,} agent-steps: return {evaluation.mean_return:.3f}, task error "
+                    f"{evaluation.final_task_error:.3f} {unit}, |e| {evaluation.max_normalized_disagreement:.3f}"
                 )
 
-        training = train(config, folder, resume=resume, on_progress=told)
-    best = max((one.mean_return for one in training.curve), default=None)
-    if training.finished:
-        typer.echo(f"best of {len(training.curve)} evaluations: {best:.3f}; {training.seconds:.0f} s")
-    else:
-        say("interrupted; the same command with --resume goes on from the last checkpoint")
-    typer.echo(f"policies: {folder / 'best.npz'}, {folder / 'last.npz'}; curve: {folder / 'curve.csv'}")
-    command = ["khop", "evaluate", environment, *(["--scenario", scenario] if scenario else [])]
-    typer.echo(f"play it: {shlex.join([*command, '--policies', f'{algo}:{folder}'])}")
+        training = train(chosen, folder, resume=resume, on_progress=report)
+    best = max((each.mean_return for each in training.curve), default=None)
+    files = {"best": folder / "best.npz", "last": folder / "last.npz"}
+    files |= {"config": folder / "config.toml", "curve": folder / "curve.csv"}
+    if as_json:
+        found: dict[str, Any] = {
+            "config": chosen.as_dict(),
+            "curve": [dataclasses.asdict(each) for each in training.curve],
+        }
+        found |= {"best_return": best, "task_error_unit": unit, "finished": training.finished}
+        found |= {"seconds": training.seconds, "folder": str(folder)}
+        print_json({**found, "files": {name: str(path) for name, path in files.items()}})
+    elif training.finished:
+        print_text(f"best of {len(training.curve)} evaluations: return {best:.3f}; {training.seconds:.0f} s")
+    if not training.finished:
+        say("khop: interrupted; the same command with --resume continues from the last checkpoint")
+    if not as_json:
+        for name, path in files.items():
+            typer.echo(f"{name}: {path}")
+        typer.echo(f"play it: {_play(chosen, folder)}")
+
+
+def _chosen(file: Path | None, settings: list[str], options: Mapping[str, Any], env: list[str]) -> TrainingConfig:
+    """The settings: those of the options, then of --set, then of the file, then the defaults.
+
+    Raises:
+        ValueError: for a wrong file, setting or argument, or no environment.
+    """
+    from agents.learning import TrainingConfig
+    from agents.learning.config_file import read_config, setting_types
+    from khop_env.registry import find_task
+    from khop_env.typed import environment_arguments, environment_types, fitting_values, typed_values
+
+    found = {} if file is None else read_config(file)
+    known = {name: kind for name, kind in setting_types().items() if name != "arguments"}
+    found |= {**typed_values(settings, "--set", known), **options}
+    if "environment" not in found:
+        raise ValueError("name an environment to train for, khop train ENV, or a --config file that names it")
+    task = find_task(found["environment"])
+    elsewhere = {"observe": "--observe", "bounds": "--bounds"}
+    arguments = fitting_values(found.get("arguments", {}), f"{file}: arguments", environment_types(task))
+    found["arguments"] = arguments | environment_arguments(env, task, elsewhere)
+    if found.get("scenario") is not None:
+        load(found["scenario"])  # refuses one with a law that there isn't, as every command does
+    return TrainingConfig(**({**_OF_SAC, **found} if found.get("algorithm") == "sac" else found))
+
+
+def _folder(config: TrainingConfig, environment: str) -> str:
+    extras = "bounds" * config.bounds, "per_type" * config.per_type
+    return folder_name(
+        environment, str(config.scenario or ""), config.observe, *extras, f"{config.algorithm}-{config.seed}"
+    )
+
+
+def _play(config: TrainingConfig, folder: Path) -> str:
+    """The command that plays what was trained."""
+    command = ["khop", "evaluate", str(config.environment)]
+    command += ["--scenario", str(config.scenario)] if config.scenario else []
+    for name, value in config.as_dict()["arguments"].items():
+        command += ["--env", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    return shlex.join([*command, "--policies", f"{config.algorithm}:{folder}"])

@@ -108,9 +108,9 @@ def as_actuator(actuator: str | Actuator) -> Actuator:
     return ACTUATORS[actuator]()
 
 
-def described(actuator: Actuator) -> str:
-    """Text that is the same for equal actuators: the class, and the parameters of a dataclass."""
-    return repr(actuator) if is_dataclass(actuator) else type(actuator).__name__
+def described(part: object) -> str:
+    """Text that is the same for equal actuators, disturbances or bounds: the class, and a dataclass's parameters."""
+    return repr(part) if is_dataclass(part) else type(part).__name__
 
 
 def _require_positive(actuator: Actuator, name: str) -> None:

@@ -79,12 +79,12 @@ def signature(
     """Properties, in words, that two environments must have in common to continue from each other's state."""
     design = world.design
     steps = f"{settings.control_period:g} s in {settings.substeps} steps of order {settings.order}"
-    bounds = dict.fromkeys(repr(bound) for bound in (*design.states.bounds, *design.inputs.bounds))
+    bounds = dict.fromkeys(described(bound) for bound in (*design.states.bounds, *design.inputs.bounds))
     return {
         **task.signature(world),
-        "actuators": (described(settings.actuator),),  # type: ignore[arg-type]
+        "actuators": (described(settings.actuator),),
         "control periods": (steps,),
-        "disturbances": (repr(disturbance),),
+        "disturbances": ("none" if disturbance is None else described(disturbance),),
         "bounds": tuple(bounds),
         "numbers of hops": (f"k = {design.k}",),
     }

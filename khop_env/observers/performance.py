@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from khop_env.compiled import compiled
 from khop_env.elementary import expm1
+from khop_env.physics import read_only
 
 FloatArray = NDArray[np.float64]
 
@@ -130,7 +131,7 @@ class FunnelBank:
         """
         exponentials(t, *self.coefficients, out)
         for row, function in self._others:
-            out[row] = function(t)
+            out[row] = function(read_only(t[:]))
             if not np.all((out[row] > 0.0) & np.isfinite(out[row])):
                 raise ValueError(
                     f"performance function {function!r} gave {out[row].min()} at t in [{t.min()}, {t.max()}] s; "

@@ -36,7 +36,7 @@ class Prediction:
         """Write f_i(x_hat) + g_hat into `out` (P, B), at times (B,), estimates (P, B) and input estimates (Q, B)."""
         if not self._all_drifts_known:
             out.fill(0.0)
-        times = t[:, None]
+        times = read_only(t[:, None])
         for model, columns, pairs in self._drifts:
             rates = model.drift(times, read_only(estimate[columns].T.reshape(self._num_envs, pairs, model.n)))
             out[columns] = rates.reshape(self._num_envs, -1).T

@@ -13,12 +13,13 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
+Array = TypeVar("Array", bound=np.ndarray)
 IndexArray: TypeAlias = NDArray[np.intp]
 InputLimit: TypeAlias = Any  # set to a number or one per input; read as a float array of shape (m,)
 
@@ -32,7 +33,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f"known: {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}"
 
 
-def read_only(view: FloatArray) -> FloatArray:
+def read_only(view: Array) -> Array:
     """The view itself, which can't be written through any more."""
     view.flags.writeable = False
     return view

@@ -214,6 +214,16 @@ class Fleet:
         """Positions of all agents, shape (B, N, d), from fleet states (B, n)."""
         return np.take(x, self.position_index, axis=-1)
 
+    def position_unit(self, axis: int | None = None) -> str:
+        """Unit of positions along an axis, or of distances: "m", or "m or rad" where agents or axes differ.
+
+        Args:
+            axis: number of the axis; None for all.
+        """
+        chosen = range(self.position_dim) if axis is None else [axis]
+        units = [group.model.states[group.model.position[each]] for each in chosen for group in self.groups]
+        return " or ".join(dict.fromkeys(units))
+
     def _runs(self) -> tuple[Group, ...]:
         firsts = [0, *(i for i in range(1, len(self)) if self.models[i] != self.models[i - 1])]
         groups = []

@@ -16,16 +16,17 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
 
 
 def error_over_time(
-    time: FloatArray, errors: Mapping[tuple[str, str], FloatArray], path: str | Path, title: str
+    time: FloatArray, errors: Mapping[tuple[str, str], FloatArray], path: str | Path, title: str, unit: str = "m"
 ) -> Path:
     """Task error over time per row: the median over episodes, and the band that holds the middle half.
 
     Args:
         time: (T,) in s.
-        errors: (T, E) in m by (policy, observation mode): policies differ in colour and modes in dashes; the
+        errors: (T, E) in `unit` by (policy, observation mode): policies differ in colour and modes in dashes; the
             modes of a single policy in both.
         path: path of the image file.
         title: title of the figure.
+        unit: unit of the task error.
 
     Returns:
         The path.
@@ -48,7 +49,7 @@ def error_over_time(
         axes.set_yscale("log")
         axes.set_xlim(0.0, float(time[-1]))
         axes.set_xlabel("time (s)")
-        axes.set_ylabel("task error, mean over agents (m)")
+        axes.set_ylabel(f"task error, mean over agents ({unit})")
         figure.suptitle(title, fontsize=10.5, color="#333333")
         # one legend entry per colour and per line style; curves may coincide, e.g. of policies that ignore observations
         entries = [
@@ -66,7 +67,11 @@ def error_over_time(
 
 
 def set_iss_figure(
-    injected: Sequence[Mapping[str, Any]], swept: Sequence[Mapping[str, Any]], path: str | Path, title: str
+    injected: Sequence[Mapping[str, Any]],
+    swept: Sequence[Mapping[str, Any]],
+    path: str | Path,
+    title: str,
+    unit: str = "m",
 ) -> Path:
     """Theorem 4 in two panels: ultimate distance to the goal set against errors, and against delta(inf).
 
@@ -75,6 +80,7 @@ def set_iss_figure(
         swept: rows of `agents.set_iss.swept_bounds`.
         path: path of the image file.
         title: title of the figure.
+        unit: unit of positions.
 
     Returns:
         The path.
@@ -96,8 +102,8 @@ def set_iss_figure(
                 [*bound], [*bound.values()], color="black", linestyle=(0, (5, 2)), label=r"analytical gain $\gamma$"
             )
         left.set_title("(a) Injected errors, no disturbance", loc="left")
-        left.set_xlabel("norm of the errors in the law's arguments (m)")
-        left.set_ylabel("ultimate distance to the goal set (m)")
+        left.set_xlabel(f"norm of the errors in the law's arguments ({unit})")
+        left.set_ylabel(f"ultimate distance to the goal set ({unit})")
         for color, (observers, disturbed), marker in zip(
             (*COLORS[:3], COLORS[4]),
             dict.fromkeys((row["observers"], row["disturbed"]) for row in swept),
@@ -119,8 +125,8 @@ def set_iss_figure(
                 float(np.mean(floors)), color=COLORS[3], linestyle=(0, (1.5, 1.5)), label="floor of the oracle"
             )
         right.set_title(r"(b) Estimates, with the bound's final value $\delta(\infty)$ swept", loc="left")
-        right.set_xlabel(r"$\delta(\infty)$ (m)")
-        right.set_ylabel("ultimate distance, or its excess over the oracle's (m)")
+        right.set_xlabel(rf"$\delta(\infty)$ ({unit})")
+        right.set_ylabel(f"ultimate distance, or its excess over the oracle's ({unit})")
         for axes in (left, right):
             axes.set_xscale("log")
             axes.set_yscale("log")

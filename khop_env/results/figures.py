@@ -122,12 +122,12 @@ def _draw_positions(axes: Axes, recording: Recording) -> None:
     if len(types) > 1:
         axes.legend(loc="best", fontsize=8.5)
     if planar:
-        axes.set_xlabel("first coordinate (m)")
-        axes.set_ylabel("second coordinate (m)")
+        axes.set_xlabel(f"first coordinate ({fleet.position_unit(0)})")
+        axes.set_ylabel(f"second coordinate ({fleet.position_unit(1)})")
         axes.set_aspect("equal", adjustable="datalim")
     else:
         axes.set_xlabel("time (s)")
-        axes.set_ylabel("position (m)")
+        axes.set_ylabel(f"position ({fleet.position_unit(0)})")
 
 
 def _label_starts(axes: Axes, starts: FloatArray, labels: list[str]) -> None:

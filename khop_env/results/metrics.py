@@ -11,7 +11,7 @@ import numpy as np
 import khop_env
 from khop_env.observers import FloatArray, Observers
 from khop_env.physics import Fleet
-from khop_env.results.recording import Recording
+from khop_env.results.recording import Recording, StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe
 
@@ -19,7 +19,7 @@ _ABSURD = 1e6  # times the largest initial state; no task leads agents so far aw
 
 
 def consensus_error(fleet: Fleet, x: FloatArray) -> FloatArray:
-    """(...,) |Pi p|: distance of the agents' positions p from agreement, in m.
+    """(...,) |Pi p|: distance of the agents' positions p from agreement, in their unit.
 
     Pi subtracts the mean (the paper's disagreement projection), applied to the stacked position outputs, so that it is
     defined for mixed fleets, too.
@@ -93,9 +93,10 @@ def summarize(
         "max_error_to_bound": finite(state_ratios[1]),
         "max_normalized_disagreement_input": finite(input_ratios[0]) if has_inputs else None,
         "max_error_to_bound_input": finite(input_ratios[1]) if has_inputs else None,
+        "position_unit": recording.fleet.position_unit(),
         "final_consensus_error": finite(float(consensus_error(recording.fleet, recording.x[-1]))),
         "diverged": _diverged(recording.x),
-        "funnel_kept": recording.completed and kept,
+        "funnel_kept": (recording.completed or isinstance(recording.error, StoppedError)) and kept,
         "error": None if recording.error is None else str(recording.error),
         "versions": {
             "khop_env": khop_env.__version__,

@@ -24,6 +24,13 @@ MOST_ROWS = 5_000_000
 _TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.07000000000000001
 
 
+class StoppedError(RuntimeError):
+    """What is recorded can't go on, for a reason that isn't the observers' or the plant's."""
+
+
+Failure = FunnelError | SolveError | StoppedError
+
+
 @dataclass(frozen=True, eq=False)
 class ObserverRecord:
     """The samples of one kind of observer: of the states (PPSO), or of the inputs' effects g (PPIO).
@@ -95,7 +102,7 @@ class Recording:
     extremes: Extremes
     steps: int
     wall_time: float
-    error: FunnelError | SolveError | None = None
+    error: Failure | None = None
     task_error: FloatArray | None = None
 
     def __repr__(self) -> str:
@@ -125,6 +132,7 @@ def record(
     *,
     samples_per_second: float = 100.0,
     task_error: Callable[[], float] | None = None,
+    ended: Callable[[], bool] | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Run the simulator from its current time to `duration`, and record samples.
@@ -138,6 +146,7 @@ def record(
         samples_per_second: upper limit; there are fewer if steps are longer, or if an array would hold more than
             `MOST_ROWS` numbers.
         task_error: returns the current error of the environment's task, to be sampled; or None.
+        ended: returns whether the episode is over before its time; called after every step.
         progress: called repeatedly with the completed fraction.
 
     Returns:
@@ -157,7 +166,7 @@ def record(
     most_samples = max(2, MOST_ROWS // width)
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
     samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error)
-    error: FunnelError | SolveError | None = None
+    error: Failure | None = None
     with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError and the summary do
         simulator.warm_up()
         start = reported = clock.perf_counter()
@@ -168,12 +177,15 @@ def record(
                 until = duration if k == steps else round(k * dt, _TIME_DECIMALS)
                 simulator.step(until - float(simulator.t[0]))
                 done = k
-                if k % stride == 0 or k == steps:
+                over = ended is not None and ended()
+                if k % stride == 0 or k == steps or over:
                     samples.take()
+                if over:
+                    break
                 if progress is not None and (now := clock.perf_counter()) - reported > 0.1:
                     reported = now
                     progress(k / steps)
-        except (FunnelError, SolveError) as stopped:  # the state before the failed step is kept
+        except (FunnelError, SolveError, StoppedError) as stopped:  # the state before the failed step is kept
             error = stopped
             if done % stride:
                 samples.take()
@@ -208,7 +220,7 @@ class _Samples:
             self._arrays[name][self._taken] = read()
         self._taken += 1
 
-    def recording(self, steps: int, wall_time: float, error: FunnelError | SolveError | None) -> Recording:
+    def recording(self, steps: int, wall_time: float, error: Failure | None) -> Recording:
         design = self._simulator.design
         kept = {name: values[: self._taken] for name, values in self._arrays.items()}
         time = kept["time"][:, 0]

@@ -10,7 +10,7 @@ import numpy as np
 from khop_env.observers import DesignError, Exponential, FloatArray, Funnels, ObserverDesign, PerformanceFunction
 from khop_env.results.assumptions import assumptions
 from khop_env.scenarios import Scenario
-from khop_env.simulation.simulator import parts_of_step
+from khop_env.simulation.plant import parts_of_step
 
 
 def design_report(scenario: Scenario) -> dict[str, Any]:

@@ -74,7 +74,8 @@ def write_video(
         path: path of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
         observer: id or index of the agent whose estimates are drawn; by default the agent with most task edges to
             agents that aren't its neighbours.
-        env: the environment of the run, for its task; None for agreement along the scenario's task graph.
+        env: the environment of the run, for its task and the mean of its task error; None for agreement along the
+            scenario's task graph, with the consensus error |Pi p|.
         fps: frames per second, up to 50.
         speed: simulated seconds per second of the film.
         progress: called with the completed fraction.

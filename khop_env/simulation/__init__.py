@@ -1,7 +1,8 @@
 """Plant and observers advance together: the plant's stepper, the simulator, its state, and the view of a law."""
 
+from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant
-from khop_env.simulation.simulator import InitialSet, Simulator
+from khop_env.simulation.simulator import Simulator
 from khop_env.simulation.state import LinkState, SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, View, ViewBuilder
 

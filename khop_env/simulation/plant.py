@@ -6,6 +6,7 @@ disturbances and users get views (B, ...) of them.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from khop_env.elementary import all_finite, weighted_sum
 from khop_env.observers import FloatArray, PlantState, SolveError
 from khop_env.physics import Fleet, read_only
 from khop_env.simulation.view import Law, ViewBuilder
+
+MOST_PARTS = 10_000
+"""Steps of the integrator that one `Simulator.step` may be divided into."""
 
 
 class FleetPlant:
@@ -33,16 +37,17 @@ class FleetPlant:
         self.fleet, self.num_envs = fleet, num_envs
         self.disturbance, self.law, self.views = disturbance, law, views
         self._rates: tuple[FloatArray, ...] = ()
-        self._states = self._inputs = self._effects = np.zeros((0, 0))
+        self._states = self._inputs = self._effects = self._drawn = np.zeros((0, 0))
+        self._t = np.zeros(0)
         self._w = np.zeros((fleet.n, num_envs)).T  # (B, n) in the memory order of the states
 
     def rate(self, state: PlantState, out: FloatArray) -> None:
         """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
         states = self._bind(state)
-        self.fleet.drift(state.t, states, out.T)
+        self.fleet.drift(self._t, states, out.T)
         out += state.g
         if self.disturbance is not None:
-            out += self.disturbance(state.t, states, state.drawn, self._w).T
+            out += self.disturbance(self._t, states, self._drawn, self._w).T
 
     def stage(self, number: int, weights: FloatArray, elapsed: float, before: PlantState, state: PlantState) -> None:
         """Move `state` to stage `number`: `before` plus the rates so far times `weights`, `elapsed` seconds later.
@@ -63,22 +68,23 @@ class FleetPlant:
         Raises:
             ValueError: if the law returns inputs of a wrong shape.
         """
+        states = self._bind(state)
         if self.law is not None:
             assert self.views is not None
-            u = self.law(state.t, self.views.update(state.x, state.memory["estimate"]))
+            u = self.law(self._t, self.views.update(state.x, state.memory["estimate"]))
             if np.shape(u) != (self.num_envs, self.fleet.m):
                 raise ValueError(
                     f"law {self.law!r} returned inputs of shape {np.shape(u)}; expected (environments, inputs) = "
                     f"{(self.num_envs, self.fleet.m)}"
                 )
             state.u.T[:] = u
-        states = self._bind(state)
-        self.fleet.input_map(state.t, states, self._inputs, self._effects)
+        self.fleet.input_map(self._t, states, self._inputs, self._effects)
 
     def _bind(self, state: PlantState) -> FloatArray:
-        """The states (B, n) as models see them; views are made once, and again for the arrays of another state."""
+        """The states (B, n) as models see them; read-only views are made once, and again for another state's arrays."""
         if self._states.base is not state.x:
             self._states, self._inputs = read_only(state.x.T), read_only(state.u.T)
+            self._t, self._drawn = read_only(state.t[:]), read_only(state.drawn[:])
             self._effects = state.g.T
         return self._states
 
@@ -97,3 +103,22 @@ def require_finite(x: FloatArray, fleet: Fleet) -> None:
             f"environment {env}: state {name!r} of {agent!r} became {x[column, env]}; check its agent model, the law "
             "and the disturbance, or take a shorter step if the plant itself diverged"
         )
+
+
+def parts_of_step(dt: float, longest: float, agent: str) -> int:
+    """Number of equal parts into which a step is divided, so that the plant's drift is stable in each of them.
+
+    Args:
+        dt: step in s.
+        longest: longest step for which the drift is stable (`Fleet.explicit_step`), in s.
+        agent: id of the agent with this drift, for the error.
+
+    Raises:
+        ValueError: for more than `MOST_PARTS`.
+    """
+    if dt > MOST_PARTS * longest:
+        raise ValueError(
+            f"dt = {dt:g} s is too long: the drift of {agent!r} takes {longest:.3g} s at a time, and no step is "
+            f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
+        )
+    return max(1, math.ceil(dt / longest))

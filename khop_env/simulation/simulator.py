@@ -5,14 +5,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.brief import brief, spread
+from khop_env.brief import spread
 from khop_env.observers import (
     Certified,
     Extremes,
@@ -27,64 +26,12 @@ from khop_env.observers import (
 )
 from khop_env.observers.disagreement import disagreement
 from khop_env.physics import read_only
-from khop_env.simulation.plant import FleetPlant
+from khop_env.simulation.initial import InitialSet
+from khop_env.simulation.plant import FleetPlant, parts_of_step
 from khop_env.simulation.state import LinkState, SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
 
 _WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
-
-MOST_PARTS = 10_000
-"""Steps of the integrator that one `Simulator.step` may be divided into."""
-
-
-@dataclass(frozen=True, eq=False)
-class InitialSet:
-    """Where states start: uniformly in a box. Its centre is the observers' common first guess.
-
-    Attributes:
-        center: (n,) in the states' units.
-        radius: (n,) half widths, not negative.
-
-    Raises:
-        ValueError: if they differ in shape, or a number isn't finite or a half width negative.
-    """
-
-    center: FloatArray
-    radius: FloatArray
-
-    __repr__ = brief
-
-    def __post_init__(self) -> None:
-        center, radius = np.asarray(self.center, dtype=float), np.asarray(self.radius, dtype=float)
-        if center.ndim != 1 or center.shape != radius.shape or not np.isfinite([center, radius]).all():
-            raise ValueError(f"center and radius must be finite, (n,) each; got {self.center!r} and {self.radius!r}")
-        if (radius < 0.0).any():
-            raise ValueError(f"radius must not be negative; got {radius.min():g} for component {radius.argmin()}")
-        object.__setattr__(self, "center", center)
-        object.__setattr__(self, "radius", radius)
-
-    def draw(self, rng: np.random.Generator) -> FloatArray:
-        """One (n,) initial state."""
-        return self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
-
-
-def parts_of_step(dt: float, longest: float, agent: str) -> int:
-    """Number of equal parts into which a step is divided, so that the plant's drift is stable in each of them.
-
-    Args:
-        dt: step in s.
-        longest: longest step for which the drift is stable (`Fleet.explicit_step`), in s.
-        agent: id of the agent with this drift, for the error.
-
-    Raises:
-        ValueError: for more than `MOST_PARTS`.
-    """
-    if dt > MOST_PARTS * longest:
-        raise ValueError(
-            f"dt = {dt:g} s is too long: the drift of {agent!r} takes {longest:.3g} s at a time, and no step is "
-            f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
-        )
-    return max(1, math.ceil(dt / longest))
 
 
 class Simulator:

@@ -85,9 +85,9 @@ class ViewBuilder:
         self.view = View(
             fleet=fleet,
             x=np.zeros((num_envs, fleet.n)),
-            edges=edges,
+            edges=read_only(edges[:]),
             known=np.broadcast_to(self._kind < 2, (num_envs, len(edges))),
-            displacement=self._columns.transpose(2, 0, 1),
+            displacement=read_only(self._columns.transpose(2, 0, 1)),
         )
 
     @property

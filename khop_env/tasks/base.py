@@ -211,6 +211,10 @@ class Task(abc.ABC):
             world: at the end of a control period.
         """
 
+    def error_unit(self, world: World) -> str:
+        """Unit of "task_error"; by default that of positions."""
+        return world.fleet.position_unit()
+
     def robust_reward(self, reward: FloatArray, infos: Mapping[str, FloatArray], limit: float) -> FloatArray:
         """Rewards for training, in which rare large errors don't dominate; by default the rewards as they are.
 

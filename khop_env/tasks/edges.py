@@ -108,7 +108,12 @@ class EdgeTask(Task):
         reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
         desired = self._desired(agent, other)
         names = axis_names(world.fleet.position_dim)
-        return [Column(f"displacement.{axis}", "m", -reach, reach, d) for axis, d in zip(names, desired, strict=True)]
+        model = world.fleet.models[other]
+        units = [model.states[name] for name in model.position]
+        return [
+            Column(f"displacement.{axis}", unit, -reach, reach, d)
+            for axis, unit, d in zip(names, units, desired, strict=True)
+        ]
 
     def evaluate(self, world: World) -> Outcome:
         """See the class; "task_error" is the root mean square error along the agent's own edges in m."""

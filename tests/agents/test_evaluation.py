@@ -139,7 +139,7 @@ class Stubborn:
         (lambda seen: {agent: [[0.0], [0.0, 1.0]] for agent in seen}, "of 'drifter_0' aren't numbers: .*0.0, 1.0"),
         (
             lambda seen: {agent: np.full((2, 2), np.nan) for agent in seen},
-            "action of 'drifter_0' in copy 0 isn't finite",
+            "action of 'drifter_0' in environment 0 isn't finite",
         ),
     ],
 )

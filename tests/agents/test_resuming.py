@@ -164,7 +164,7 @@ def changed(tree, path, value):
 
 def test_crafted_checkpoints_are_refused(tiny, tmp_path):
     """Any changed value gives a CheckpointError, or a state that training continues from."""
-    run, content = _Run(TINY, None, None, None), read_checkpoint(tiny[1] / CHECKPOINT)
+    run, content = _Run(TINY, None, None, None, TINY), read_checkpoint(tiny[1] / CHECKPOINT)
     content = {key: content[key] for key in ("model", "environment", "rewards", "before", "curve", "seconds")}
     places = [path for path in leaves(content) if "python" not in path]  # 625 numbers of a generator
     values = [..., None, "text", -1, 10**40, 0.5, [], {}, np.zeros(3), np.array("text"), np.full((2, 2), np.nan)]

@@ -279,3 +279,33 @@ def test_units_are_the_models_own():
         shown = {one: u for one, u in units.items() if one == f"own.{state}" or one.startswith(f"own.{state}.")}
         assert shown == ({f"own.{state}.cos": "", f"own.{state}.sin": ""} if unit == "rad" else {f"own.{state}": unit})
     assert units["slot0.displacement.x"] == units["slot0.position.y"] == "m"
+
+
+@pytest.mark.parametrize("limit", [0.25, 0.9, 1.0, 3.0])
+def test_a_component_keeps_its_own_bounds_in_a_column_that_agents_of_several_types_share(limit):
+    """With a limit below 1 an angle's cosine may be larger than a speed; one Box has to hold both."""
+    padded = parallel("consensus_v0", "mixed_fleet", uniform=True, bounds=True, limit=limit)
+    ragged = parallel("consensus_v0", "mixed_fleet", uniform=False, bounds=True, limit=limit)
+    seen, counts = set(), []
+    for seed in range(3):
+        observations, infos = padded.reset(seed=seed)
+        expected, infos_expected = ragged.reset(seed=seed)
+        for _ in range(3):
+            for i, agent in enumerate(padded.agents):
+                found = padded.layout(agent).read(observations[agent])
+                exact = ragged.layout(agent).read(expected[agent])
+                assert {name: found[name] for name in exact} == exact
+                for name, value in expected_own(ragged, i).items():
+                    most = 1.0 if name.endswith((".cos", ".sin")) else limit
+                    assert found[name] == np.float32(np.clip(value, -np.float32(most), np.float32(most)))
+                    seen |= {name.rpartition(".")[2]} if abs(value) > most else set()
+                assert infos[agent]["clipped_observations"] == infos_expected[agent]["clipped_observations"]
+                counts.append(infos[agent]["clipped_observations"])
+                assert padded.observation_space(agent).contains(observations[agent])
+            actions = {agent: np.full(padded.action_space(agent).shape, 0.5, np.float32) for agent in padded.agents}
+            sizes = {agent: ragged.action_space(agent).shape[0] for agent in ragged.agents}
+            observations, _, _, _, infos = padded.step(actions)
+            expected, _, _, _, infos_expected = ragged.step({a: u[: sizes[a]] for a, u in actions.items()})
+    assert max(counts) > 0
+    if limit == 0.25:
+        assert {"surge", "vx"} & seen  # clipped, where other types have a cosine in the same column

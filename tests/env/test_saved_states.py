@@ -1,10 +1,13 @@
 """Saved states go into environments of their own kind only, and a refusal leaves no trace."""
 
+import networkx as nx
 import numpy as np
 import pytest
 
-from khop_env import consensus_v0
+from khop_env import consensus_v0, scenario
 from khop_env.env import Lag
+from khop_env.observers import Exponential
+from khop_env.physics import Sinusoid
 from tests.env.playing import batched, parallel, play, same, state
 
 
@@ -66,6 +69,85 @@ def test_states_of_the_same_size_but_of_another_task_or_actuator_are_refused(the
         env.set_state(other.get_state())
     assert same(state(env), state(clean))
     assert same(play(env, 2), play(clean, 2))
+
+
+def paper_with(**changes):
+    return {"scenario": scenario("paper").replace(**changes)}
+
+
+def star(k):
+    """Everybody is within two hops: a third changes no size."""
+    graph = nx.star_graph(7)
+    return {"scenario": scenario("paper").replace(communication=graph, task=graph, k=k)}
+
+
+@pytest.mark.parametrize(
+    ("theirs", "mine", "differing"),
+    [
+        (
+            {"control_period": 0.1},
+            {},
+            "control periods differ: 0.1 s in 1 steps of order 1 there, 0.05 s in 1 steps of order 1 here",
+        ),
+        ({}, {"dt": 0.01}, "control periods differ: 0.05 s in 1 steps of order 1 there, 0.05 s in 5 steps of order 1"),
+        ({"order": 2}, {}, "control periods differ: .* order 2 there, .* order 1 here"),
+        (
+            paper_with(disturbance=Sinusoid(0.2)),
+            paper_with(disturbance=Sinusoid(0.1)),
+            r"disturbances differ: Sinusoid\(amplitude=0.2, .*\) there, Sinusoid\(amplitude=0.1, .*\) here",
+        ),
+        (
+            paper_with(disturbance=None),
+            paper_with(disturbance=Sinusoid(0.0)),
+            r"disturbances differ: none there, Sinusoid\(amplitude=0.0, .*\) here",
+        ),
+        (
+            paper_with(delta=Exponential(90.0, 0.5, 5.0)),
+            paper_with(delta=Exponential(90.0, 0.4, 5.0)),
+            r"bounds differ: Exponential\(.*final=0.5, rate=5.0\) there, Exponential\(.*final=0.4, rate=5.0\) here",
+        ),
+        (
+            paper_with(theta=Exponential(300.0, 1.5, 5.0)),
+            paper_with(theta=Exponential(300.0, 1.5, 4.0)),
+            r"bounds differ: .* there, Exponential\(.*rate=4.0\) here",
+        ),
+        (
+            star(2),
+            star(3),
+            "numbers of hops differ: k = 2 there, k = 3 here; make both with the same arguments",
+        ),
+    ],
+)
+def test_states_of_another_period_order_disturbance_bound_or_number_of_hops_are_refused(theirs, mine, differing):
+    """All of the same size, so that nothing but words tells them apart."""
+    env, clean = (consensus_v0.parallel_env(**mine) for _ in range(2))
+    other = consensus_v0.parallel_env(**theirs)
+    other.reset(seed=0)
+    assert same(env.reset(seed=1), clean.reset(seed=1))
+    with pytest.raises(ValueError, match=f"can't restore: the state is of another environment, the {differing}"):
+        env.set_state(other.get_state())
+    assert same(state(env), state(clean))
+    assert same(play(env, 2), play(clean, 2))
+
+
+class Floor:
+    """A bound of a user's own, without a repr."""
+
+    def __call__(self, t):
+        return np.full_like(t, 90.0)
+
+    def infimum(self):
+        return 90.0
+
+
+def test_bounds_of_one_s_own_are_known_by_their_class():
+    """Not by where an object is in memory: the same scenario, made twice, is the same."""
+    env, other = (consensus_v0.parallel_env(**paper_with(delta=Floor())) for _ in range(2))
+    env.reset(seed=1)
+    other.set_state(env.get_state())
+    assert same(play(other, 2), play(env, 2))
+    with pytest.raises(ValueError, match=r"bounds differ: Floor there, Exponential\(.*\) here"):
+        parallel("consensus_v0").set_state(env.get_state())
 
 
 class Halved:

@@ -11,7 +11,7 @@ from khop_env.observers import Exponential, ObserverDesign, Proximal
 from khop_env.physics import DoubleIntegrator, Fleet, SingleIntegrator, SurfaceVessel
 from khop_env.registry import scenario, scenarios
 from khop_env.simulation import InitialSet, Simulator
-from khop_env.simulation.simulator import parts_of_step
+from khop_env.simulation.plant import parts_of_step
 from tests.strategies import System, systems
 
 STEPS = st.floats(np.log(1e-4), 0.0).map(lambda exponent: float(np.exp(exponent)))

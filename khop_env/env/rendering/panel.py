@@ -62,6 +62,7 @@ class Panel:
         task: whether there are task edges.
         observer: id and look of the agent whose estimates are drawn; None without estimates.
         error_label: name of the error beside the gauge.
+        error_unit: its unit.
     """
 
     def __init__(
@@ -74,9 +75,10 @@ class Panel:
         task: bool,
         observer: tuple[str, Look] | None,
         error_label: str = "task error",
+        error_unit: str = "m",
     ) -> None:
         self._left, self._top, self._width, _ = rect
-        self._unit, self._error_label = unit, error_label
+        self._unit, self._error_label, self._error_unit = unit, error_label, error_unit
         self._types, self._driven, self._task, self._observer = types, driven, task, observer
 
     def draw(self, canvas: Canvas, t: float, normalized: float, task_error: float | None, hidden: int) -> None:
@@ -86,14 +88,14 @@ class Panel:
             canvas: to draw on.
             t: in s.
             normalized: largest |e|.
-            task_error: in m, if there is one.
+            task_error: if there is one.
             hidden: number of guaranteed boxes that are larger than the view.
         """
         self._line = self._top + 12 * self._unit
         self._write(canvas, f"t = {t:.2f} s", size=20, advance=38)
         self._draw_gauge(canvas, normalized)
         if task_error is not None:
-            self._write(canvas, f"{self._error_label}  {task_error:#.3g} m", advance=20)
+            self._write(canvas, f"{self._error_label}  {task_error:#.3g} {self._error_unit}", advance=20)
         self._draw_legend(canvas)
         if hidden:
             boxes = "box is" if hidden == 1 else "boxes are"

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from khop_env.env.rendering.camera import Camera, Labels
 from khop_env.env.rendering.canvas import Canvas, Window
-from khop_env.env.rendering.panel import CIRCLE, Panel, draw_agent, draw_task_edge
+from khop_env.env.rendering.on_map import OnMap
+from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import (
     EDGE_COLOR,
     PALE,
@@ -53,6 +54,7 @@ class Renderer:
             targets.
         title: text above the picture.
         error_label: name of the error beside the map.
+        error_unit: its unit; by default that of positions.
         size: width and height in pixels.
 
     Attributes:
@@ -72,6 +74,7 @@ class Renderer:
         observer: int | None = None,
         title: str = "",
         error_label: str = "task error",
+        error_unit: str | None = None,
         size: tuple[int, int] = (900, 720),
     ) -> None:
         fleet, agents = design.fleet, len(design.fleet)
@@ -103,6 +106,7 @@ class Renderer:
             task=bool(self._tasks),
             observer=(fleet.ids[self.observer], self._look[self.observer]) if self._estimates.targets else None,
             error_label=error_label,
+            error_unit=fleet.position_unit() if error_unit is None else error_unit,
         )
         self._canvas: Canvas | None = None
         self._window: Window | None = None
@@ -120,7 +124,8 @@ class Renderer:
         """
         acting = set(task.acting(world))
         driven = [i for i in range(len(world.fleet)) if i not in acting]
-        return cls(world.design, task.edges, driven=driven, driven_label=task.driven_label, **arguments)
+        label, unit = task.driven_label, task.error_unit(world)
+        return cls(world.design, task.edges, driven=driven, driven_label=label, error_unit=unit, **arguments)
 
     def restart(self) -> None:
         """Begin a new episode: clear the trails, the view and the places of labels."""
@@ -161,7 +166,7 @@ class Renderer:
             x: (n,) state of the fleet.
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
-            task_error: in m, if there is one to show.
+            task_error: if there is one to show.
             decorate: draws the task's additions, below the agents.
 
         Returns:
@@ -190,7 +195,7 @@ class Renderer:
             x: (n,) state of the fleet.
             estimates: (P,) in the order of `design.states.layout`.
             normalized: largest |e| = |xi| / rho of now.
-            task_error: in m, if there is one to show.
+            task_error: if there is one to show.
             decorate: draws the task's additions, below the agents.
 
         Raises:
@@ -241,7 +246,7 @@ class Renderer:
         self._draw_trails(canvas, t)
         hidden = self._draw_boxes(canvas, t, estimated)
         if decorate is not None:
-            decorate(_OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
+            decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
         self._draw_edges(canvas, middles)
         self._draw_agents(canvas, x, middles)
         self._draw_estimates(canvas, estimates, middles, estimate_pixels)
@@ -281,13 +286,14 @@ class Renderer:
             canvas.line(np.array([[x, top], [x, top + height]]), PALE, 1.0)
             canvas.text(text, (x, top + height + 10 * self._unit), size, color=SOFT, anchor=(0.5, 0.5))
         middle = left + width / 2, top + height + 30 * self._unit
-        canvas.text("first coordinate (m)", middle, size, color=SOFT, anchor=(0.5, 0.5))
+        canvas.text(f"first coordinate ({self._fleet.position_unit(0)})", middle, size, color=SOFT, anchor=(0.5, 0.5))
         if self._fleet.position_dim > 1:
             for y, text in self._camera.ticks(1):
                 canvas.line(np.array([[left, y], [left + width, y]]), PALE, 1.0)
                 canvas.text(text, (left - 6 * self._unit, y), size, color=SOFT, anchor=(1.0, 0.5))
             middle = 11 * self._unit, top + height / 2
-            canvas.text("second coordinate (m)", middle, size, color=SOFT, anchor=(0.5, 0.5), upright=True)
+            label = f"second coordinate ({self._fleet.position_unit(1)})"
+            canvas.text(label, middle, size, color=SOFT, anchor=(0.5, 0.5), upright=True)
         corners = np.array([[left, top], [left + width, top], [left + width, top + height], [left, top + height]])
         canvas.polygon(corners, "#BBBBBB", 1.0)
         canvas.text(self._title, (left, top / 2), round(14 * self._unit), room=self._size[0] - 2 * left)
@@ -371,36 +377,3 @@ class Renderer:
                 canvas.line(np.array([middle, middles[visible[number]]]), SOFT, 0.75)
             text = self._names[visible[number]]
             canvas.text(text, tuple(middle), size, anchor=(0.5, 0.5), halo=True)
-
-
-class _OnMap:
-    """A `tasks.MapCanvas`: drawing in metres.
-
-    Args:
-        canvas: of the frame.
-        pixels: maps points (..., 2) in m to pixels.
-        meters: per pixel.
-        radius: of an agent's marker in pixels.
-    """
-
-    def __init__(
-        self, canvas: Canvas, pixels: Callable[[FloatArray], FloatArray], meters: float, radius: float
-    ) -> None:
-        self._canvas, self._pixels, self._meters, self._radius = canvas, pixels, meters, radius
-
-    def circle(self, center: FloatArray, radius: float, color: str, *, filled: bool = False) -> None:
-        """See `tasks.MapCanvas`."""
-        outline = min(radius / self._meters, 9999.0) * CIRCLE
-        width = 0.0 if filled else 1.5
-        self._canvas.marker(outline, self._pixels(np.asarray(center, float)), 0.0, color, width)
-
-    def line(self, points: FloatArray, color: str, width: float = 2.0) -> None:
-        """See `tasks.MapCanvas`."""
-        self._canvas.line(self._pixels(np.asarray(points, float)), color, width)
-
-    def cross(self, center: FloatArray, color: str) -> None:
-        """See `tasks.MapCanvas`."""
-        middle = self._pixels(np.asarray(center, float))
-        for end in ((1.0, 1.0), (1.0, -1.0)):
-            arm = 0.9 * self._radius * np.array(end)
-            self._canvas.line(np.array([middle - arm, middle + arm]), color, 2.0)

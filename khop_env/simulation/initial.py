@@ -1,0 +1,41 @@
+"""Where states start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from khop_env.brief import brief
+from khop_env.observers import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class InitialSet:
+    """Where states start: uniformly in a box. Its centre is the observers' common first guess.
+
+    Attributes:
+        center: (n,) in the states' units.
+        radius: (n,) half widths, not negative.
+
+    Raises:
+        ValueError: if they differ in shape, or a number isn't finite or a half width negative.
+    """
+
+    center: FloatArray
+    radius: FloatArray
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        center, radius = np.asarray(self.center, dtype=float), np.asarray(self.radius, dtype=float)
+        if center.ndim != 1 or center.shape != radius.shape or not np.isfinite([center, radius]).all():
+            raise ValueError(f"center and radius must be finite, (n,) each; got {self.center!r} and {self.radius!r}")
+        if (radius < 0.0).any():
+            raise ValueError(f"radius must not be negative; got {radius.min():g} for component {radius.argmin()}")
+        object.__setattr__(self, "center", center)
+        object.__setattr__(self, "radius", radius)
+
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """One (n,) initial state."""
+        return self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
