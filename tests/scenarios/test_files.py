@@ -43,6 +43,7 @@ def everything() -> Scenario:
         communication=ring,
         task=nx.path_graph(7),
         k=3,
+        design_rule="sharp",
         relay=False,
         delta={
             "integrator": Exponential(40.0, 0.1, 4.0),
@@ -89,7 +90,9 @@ def test_a_round_trip_gives_the_same_bits(make, tmp_path):
     text = write_scenario(scenario)
     path.write_text(text, encoding="utf-8")
     again = read_scenario(path, laws=LAWS)
-    for name in ("name", "description", "k", "relay", "duration", "dt", "order", "models", "observers", "disturbance"):
+    for name in ("name", "description", "k", "relay", "design_rule", "duration", "dt", "order"):
+        assert getattr(again, name) == getattr(scenario, name), name
+    for name in ("models", "observers", "disturbance"):
         assert getattr(again, name) == getattr(scenario, name), name
     assert again.law == scenario.law
     for ours, theirs in zip(trajectory(scenario), trajectory(again), strict=True):
@@ -201,6 +204,7 @@ REFUSALS = [  # (what is replaced, by what, the key named, what else the message
     ("k = 2", "k = 1", "k", ["got 1, expected at least 2"]),
     ("k = 2", "k = 2.0", "k", ["got 2.0, expected an integer"]),
     ("k = 2", "k = 2\norder = 3", "order", ["got 3, expected 1 or 2"]),
+    ("k = 2", 'k = 2\ndesign_rule = "blunt"', "design_rule", ["got 'blunt', expected \"paper\" or \"sharp\""]),
     ("k = 2", "k = 2\nduraton = 3", "duraton", ["did you mean 'duration'?"]),
     ("k = 2", "k = 2\ndt = -1", "scenario 'small'", ["dt must be positive and finite; got -1"]),
     ("k = 2", "k =", "not a TOML file", ["line 3"]),
