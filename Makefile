@@ -2,13 +2,16 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint bench integrations clean
+.PHONY: demo test quick lint bench integrations clean
 
 demo: .venv/core
 	$(BIN)/khop run paper
 
 test: .venv/test
 	$(BIN)/python -m pytest -n auto
+
+quick: .venv/test
+	$(BIN)/python -m pytest -n auto -m quick
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -204,7 +204,7 @@ def test_a_policy_that_does_not_fit_is_refused(trained, tmp_path):
     policy.save(tmp_path / "run" / "best.npz")
     with pytest.raises(ValueError, match="was trained by ppo"):
         make_policy(f"sac:{tmp_path / 'run'}")
-    with pytest.raises(ValueError, match="no policy file named; expected ppo:FOLDER or ppo:pretrained"):
+    with pytest.raises(ValueError, match="expected ppo:FOLDER or ppo:pretrained"):
         make_policy("ppo")
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from playing import ENVIRONMENTS, parallel, play, random_actions
 
 from khop_env.env import ACTUATORS, Direct, Hold, Lag, SlewLimit
+from tests.env.playing import ENVIRONMENTS, parallel, play, random_actions
 
 PERIOD, SUBSTEPS = 0.06, 3
 

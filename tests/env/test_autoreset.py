@@ -15,10 +15,10 @@ from gymnasium.wrappers.vector import (
     RecordEpisodeStatistics,
     RescaleObservation,
 )
-from playing import INFO_KEYS, built, same
 
 from khop_env import make_vec
 from khop_env.env.vector import _WRAPPERS_MISCOUNT
+from tests.env.playing import INFO_KEYS, built, same
 
 COPIES = 3
 

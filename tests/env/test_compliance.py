@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
-from playing import CROSS, IDS, aec, built, joint, parallel, require_contract
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from khop_env.env.rendering import canvas
+from tests.env.playing import CROSS, IDS, aec, built, joint, parallel, require_contract
 
 with warnings.catch_warnings():  # the import makes example environments in a way that PettingZoo itself deprecates
     warnings.filterwarnings("ignore", "The old environment creation API", DeprecationWarning)

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 import supersuit
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-from playing import built, same
 
 from khop_env import consensus_v0, make_vec
+from tests.env.playing import built, same
 
 LIMIT = 180.0  # s; each takes a few, and all kernels may have to be compiled
 STEPS = 25

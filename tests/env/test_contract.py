@@ -7,7 +7,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from playing import (
+
+from khop_env.testing import arrays
+from tests.env.playing import (
     CROSS,
     ENVIRONMENTS,
     EVERY,
@@ -21,8 +23,6 @@ from playing import (
     same,
     state,
 )
-
-from khop_env.testing import arrays
 
 cross = pytest.mark.parametrize(("environment", "name", "observe", "uniform"), CROSS)
 every = pytest.mark.parametrize(("environment", "name"), EVERY)

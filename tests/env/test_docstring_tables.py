@@ -5,7 +5,8 @@ import re
 
 import pettingzoo
 import pytest
-from playing import ENVIRONMENTS, IDS
+
+from tests.env.playing import ENVIRONMENTS, IDS
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)

@@ -11,12 +11,12 @@ import pettingzoo
 import pytest
 import supersuit
 import torch
-from playing import ENVIRONMENTS, EVERY, IDS, aec, built, parallel, play, same
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 from khop_env import make_sb3_vec, make_vec
 from khop_env.env.rendering import canvas
+from tests.env.playing import ENVIRONMENTS, EVERY, IDS, aec, built, parallel, play, same
 
 by_name = pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="PettingZoo makes by name from 1.26 on")
 

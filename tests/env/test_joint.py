@@ -5,9 +5,9 @@ import copy
 import gymnasium
 import numpy as np
 import pytest
-from playing import ENVIRONMENTS, EVERY, IDS, INFO_KEYS, built, joint, parallel, same, state
 
 from khop_env.registry import make_joint
+from tests.env.playing import ENVIRONMENTS, EVERY, IDS, INFO_KEYS, built, joint, parallel, same, state
 
 
 def made(environment="consensus_v0", name="paper", **arguments):

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from playing import EVERY, parallel, play
 
 from khop_env.testing.leaks import changed_by
+from tests.env.playing import EVERY, parallel, play
 
 every = pytest.mark.parametrize(("environment", "name"), EVERY)
 uniform_or_ragged = pytest.mark.parametrize("uniform", [True, False])

@@ -5,12 +5,12 @@ import re
 
 import numpy as np
 import pytest
-from playing import EVERY, built, parallel, play, random_actions, same, state
 
 from khop_env import consensus_v0, formation_v0, leader_following_v0
 from khop_env.observers import DesignError
 from khop_env.physics import SingleIntegrator
 from khop_env.scenarios.files import ScenarioFileError
+from tests.env.playing import EVERY, built, parallel, play, random_actions, same, state
 
 
 def good(env):

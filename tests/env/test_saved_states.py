@@ -3,12 +3,12 @@
 import networkx as nx
 import numpy as np
 import pytest
-from playing import batched, parallel, play, same, state
 
 from khop_env import consensus_v0, scenario
 from khop_env.env import Lag
 from khop_env.observers import Exponential
 from khop_env.physics import Sinusoid
+from tests.env.playing import batched, parallel, play, same, state
 
 
 def test_states_of_other_environments_are_refused_and_change_nothing():

@@ -5,13 +5,13 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from playing import EVERY, INFO_KEYS, built, same
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from khop_env import make_sb3_vec, make_vec
+from tests.env.playing import EVERY, INFO_KEYS, built, same
 
 COPIES = 2
 

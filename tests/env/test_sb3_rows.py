@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from playing import built, same
 from stable_baselines3.common.vec_env import VecMonitor
 
 from khop_env import make_sb3_vec, make_vec
+from tests.env.playing import built, same
 
 COPIES = 2
 

@@ -6,11 +6,11 @@ import sys
 
 import numpy as np
 import pytest
-from playing import built, parallel, play, same
 
 from khop_env.env import KHopEnv
 from khop_env.env.rendering import canvas
 from khop_env.registry import make_joint
+from tests.env.playing import built, parallel, play, same
 
 FRAMES = {"render_mode": "rgb_array", "max_cycles": 20}
 

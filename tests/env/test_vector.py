@@ -7,10 +7,10 @@ import pickle
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from playing import EVERY, INFO_KEYS, built, parallel, same
 
 from khop_env import make_vec
 from khop_env.testing import arrays
+from tests.env.playing import EVERY, INFO_KEYS, built, parallel, same
 
 COPIES, CYCLES = 3, 17
 every = pytest.mark.parametrize(("environment", "name"), EVERY)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_rendering import renderer, scene
 
 import khop_env
 from khop_env.env.rendering import canvas
+from tests.env.drawing import renderer, scene
 
 
 @pytest.fixture(autouse=True)

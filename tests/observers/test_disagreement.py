@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import (
+
+from khop_env.observers import PairLayout, Proximal
+from khop_env.observers.disagreement import disagreement
+from khop_env.physics import Fleet, Links, k_hop_neighbors, validate_graph
+from tests.strategies import (
     PLANAR,
     SEEDS,
     connected_graphs,
@@ -18,10 +22,6 @@ from strategies import (
     relays,
     systems,
 )
-
-from khop_env.observers import PairLayout, Proximal
-from khop_env.observers.disagreement import disagreement
-from khop_env.physics import Fleet, Links, k_hop_neighbors, validate_graph
 
 
 @st.composite

@@ -6,7 +6,6 @@ import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from strategies import SmoothSignals, systems
 
 from agents import make_law
 from khop_env.observers import Explicit, Exponential, FunnelError, ObserverDesign
@@ -14,6 +13,7 @@ from khop_env.observers.disagreement import correction, disagreement
 from khop_env.physics import DriftingIntegrator, Fleet
 from khop_env.scenarios import paper
 from khop_env.simulation import InitialSet, Simulator
+from tests.strategies import SmoothSignals, systems
 
 MESSAGE = re.compile(
     r"the explicit step left the funnel: (?P<kind>state|input) observer of '(?P<target>\w+)' in '(?P<observer>\w+)', "

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import System, systems
 
 from agents import make_law
 from khop_env.observers import Exponential, ObserverDesign, Proximal
@@ -13,6 +12,7 @@ from khop_env.physics import DoubleIntegrator, Fleet, SingleIntegrator, SurfaceV
 from khop_env.registry import scenario, scenarios
 from khop_env.simulation import InitialSet, Simulator
 from khop_env.simulation.plant import parts_of_step
+from tests.strategies import System, systems
 
 STEPS = st.floats(np.log(1e-4), 0.0).map(lambda exponent: float(np.exp(exponent)))
 """Any step from 1e-4 s to 1 s, as likely in each decade."""

@@ -2,11 +2,11 @@
 
 import numpy as np
 from hypothesis import given, settings
-from strategies import systems
 
 from agents import make_law
 from khop_env.observers import BatchedRightHandSide, Explicit, MessagePassing, Proximal
 from khop_env.scenarios import paper
+from tests.strategies import systems
 
 
 def derivatives(simulator):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import SEEDS, exponentials
 
 from khop_env.observers import Exponential, FunnelBank, PerformanceFunction, lower_bound
+from tests.strategies import SEEDS, exponentials
 
 TIMES = np.linspace(0.0, 12.0, 241)
 

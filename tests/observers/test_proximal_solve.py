@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import SEEDS, connected_graphs, hops
 
 from khop_env.observers import PairLayout
 from khop_env.observers.solve import LANES, MAX_ITERATIONS, solve
 from khop_env.physics import Links, k_hop_neighbors
+from tests.strategies import SEEDS, connected_graphs, hops
 
 
 def layout_of(graph, k, relay, dimensions=None):

@@ -6,11 +6,11 @@ In one message agent l sends its own estimates and, under Assumption 4, the stat
 
 import numpy as np
 from hypothesis import given, settings
-from strategies import System, relays, systems
 
 from agents import TanhConsensus
 from khop_env.observers import BatchedRightHandSide, Proximal
 from khop_env.simulation.state import SimulatorState
+from tests.strategies import System, relays, systems
 
 
 class Probe:

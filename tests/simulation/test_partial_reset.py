@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import systems
 
 from agents import make_law
 from khop_env.observers import DesignError, Explicit, Proximal
 from khop_env.registry import scenario
+from tests.strategies import systems
 
 BATCH = 5
 SCENARIOS = ("paper", "convoy", "mixed_fleet", "random_geometric:agents=12")

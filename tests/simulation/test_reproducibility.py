@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import SmoothSignals, systems
 
 from agents import TanhConsensus, make_law
 from khop_env.observers import Explicit, Exponential, ObserverDesign, Proximal
@@ -15,6 +14,7 @@ from khop_env.observers.solve import LANES
 from khop_env.physics import BandLimitedNoise, DriftingIntegrator, Fleet, Sinusoid, Unicycle
 from khop_env.scenarios import paper
 from khop_env.simulation import InitialSet, Simulator, SimulatorState
+from tests.strategies import SmoothSignals, systems
 
 INTEGRATORS = {"explicit": Explicit, "order 1": lambda: Proximal(1), "order 2": lambda: Proximal(2)}
 

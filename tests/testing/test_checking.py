@@ -7,13 +7,13 @@ from functools import partial
 import numpy as np
 import pytest
 from pettingzoo.utils import parallel_to_aec
-from walkers import FAULTS, HORIZON, Buffered, LikeMpe2, Siamese, Walkers
 
 import khop_env
 from khop_env import consensus_v0, leader_following_v0
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv
 from khop_env.env.sb3 import KHopSB3VecEnv
 from khop_env.testing import CHECKS, Report, check_environment, difference
+from tests.walkers import FAULTS, HORIZON, Buffered, LikeMpe2, Siamese, Walkers
 
 ONLY = Walkers()
 OURS_ONLY = {"views", "leak", "gymnasium", "sb3"}
