@@ -14,6 +14,9 @@ from khop_env.observers.base import (
     PlantState,
     SolveError,
 )
+from khop_env.observers.boxes import Box
+from khop_env.observers.certificate import Certificate
+from khop_env.observers.dead_reckoning import Prediction, predict
 from khop_env.observers.design import Bound, DesignError, Funnels, ObserverDesign, TargetObservers
 from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
@@ -24,6 +27,8 @@ from khop_env.observers.proximal import Proximal
 __all__ = [
     "BatchedRightHandSide",
     "Bound",
+    "Box",
+    "Certificate",
     "Certified",
     "Derivative",
     "DesignError",
@@ -45,10 +50,12 @@ __all__ = [
     "PerformanceFunction",
     "Plant",
     "PlantState",
+    "Prediction",
     "Proximal",
     "RightHandSide",
     "SolveError",
     "TargetBlock",
     "TargetObservers",
     "lower_bound",
+    "predict",
 ]
