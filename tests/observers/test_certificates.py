@@ -307,6 +307,17 @@ def test_a_clock_skew_costs_age_and_drift() -> None:
     assert (np.abs(truth - center) <= radius + skew * fastest).all()
 
 
+def test_a_plant_of_euler_steps_leaves_the_box_by_its_own_error() -> None:
+    cart, h = DoubleIntegrator(0.5, 1.0), 0.05
+    x, p = np.zeros((1, 4)), np.zeros((4, 1))
+    x = x + h * (cart.drift(np.zeros(1), x) + cart.input_map(np.zeros(1), x, np.ones((1, 2))))
+    ages = np.array([h])
+    excess = x[0, 2] / Certificate(cart).radius(ages)[2, 0]
+    assert excess == pytest.approx(1.0125, abs=2e-4)
+    local = 0.51 * 0.5 * 1.0 * h * np.array([0.0, 0.0, 1.0, 1.0])  # a little over |v''| h / 2, in m/s^2
+    assert (np.abs(x.T - p) <= Certificate(cart, disturbance=local).radius(ages)).all()
+
+
 def test_columns_dont_depend_on_each_other() -> None:
     case, rng = drawn(SurfaceVessel(), 0), np.random.default_rng(0)
     ages = rng.uniform(0.0, 0.5, BATCH)
