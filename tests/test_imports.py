@@ -23,6 +23,7 @@ RANKS = [
     ],
     ["khop_env.elementary"],
     ["khop_env.physics"],
+    ["khop_env.network"],
     ["khop_env.observers"],
     ["khop_env.simulation"],
     ["khop_env.tasks"],
@@ -97,7 +98,7 @@ def imports(module: str) -> list[tuple[int, str]]:
 
 @pytest.mark.parametrize("module", [name for name in MODULES if name != "khop_env"])
 def test_nothing_imports_to_its_right(module: str) -> None:
-    """physics < observers < simulation < env < scenarios < registry and *_v0 < results < agents < cli < benchmarks."""
+    """The order of RANKS: physics < network < observers < simulation < ... < agents < cli < benchmarks."""
     wrong = [
         f"line {line}: {module} imports {other}"
         for line, other in imports(module)
@@ -123,7 +124,8 @@ def test_ranks_name_existing_rooms_in_the_architecture_s_order() -> None:
     assert len(set(names)) == len(names)
     for name in MODULES:
         assert name == "khop_env" or rank(name) >= 0
-    assert rank("khop_env.physics.graph") < rank("khop_env.observers") < rank("khop_env.simulation.plant")
+    assert rank("khop_env.physics.graph") < rank("khop_env.network") < rank("khop_env.observers")
+    assert rank("khop_env.observers") < rank("khop_env.simulation.plant")
     assert rank("khop_env.scenarios.paper") < rank("agents.laws") < rank("khop_env.cli")
 
 

@@ -14,6 +14,9 @@ from khop_env.observers.base import (
     PlantState,
     SolveError,
 )
+from khop_env.observers.boxes import Box
+from khop_env.observers.certificate import Certificate
+from khop_env.observers.dead_reckoning import Prediction, predict
 from khop_env.observers.design import (
     Bound,
     DesignError,
@@ -31,6 +34,8 @@ from khop_env.observers.proximal import Proximal
 __all__ = [
     "BatchedRightHandSide",
     "Bound",
+    "Box",
+    "Certificate",
     "Certified",
     "Derivative",
     "DesignError",
@@ -53,10 +58,12 @@ __all__ = [
     "PerformanceFunction",
     "Plant",
     "PlantState",
+    "Prediction",
     "Proximal",
     "RightHandSide",
     "SolveError",
     "TargetBlock",
     "TargetObservers",
     "lower_bound",
+    "predict",
 ]

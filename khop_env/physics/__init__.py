@@ -16,6 +16,7 @@ from khop_env.physics.graph import (
     random_geometric_graph,
     validate_graph,
 )
+from khop_env.physics.growth import Growth
 from khop_env.physics.links import Links
 from khop_env.physics.models import (
     MODELS,
@@ -43,6 +44,7 @@ __all__ = [
     "Fleet",
     "FloatArray",
     "Group",
+    "Growth",
     "Gust",
     "IndexArray",
     "Links",

@@ -18,6 +18,8 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.physics.growth import Growth
+
 FloatArray: TypeAlias = NDArray[np.float64]
 Array = TypeVar("Array", bound=np.ndarray)
 IndexArray: TypeAlias = NDArray[np.intp]
@@ -129,6 +131,29 @@ class AgentModel:
     def drift_lipschitz(self) -> float:
         """Lipschitz constant of the drift in the 2-norm: inf if it is only locally Lipschitz, nan if not declared."""
         return math.nan
+
+    def drift_growth(self, region: FloatArray | None = None) -> Growth | None:
+        """How fast two solutions of the drift may part; None, the default, if the model doesn't say.
+
+        With it, what was known of an agent some time ago is a bound on its state now (`observers.Certificate`), however
+        messages were lost in between. Without it, or outside its region, nothing is certified.
+
+        Args:
+            region: (n,) largest |x| of the agent's states at all times, inf where none is known; None for all inf.
+                Drifts that are only locally Lipschitz need one.
+        """
+        return None
+
+    def operating_region(self, reach: FloatArray, disturbance: FloatArray) -> FloatArray:
+        """Bounds that |x| never leaves as long as inputs are within their limits, shape (n,).
+
+        This default knows none: inf.
+
+        Args:
+            reach: Largest |x| that agents start with, shape (n,).
+            disturbance: Largest |w|, in state units per second, shape (n,).
+        """
+        return np.full(self.n, math.inf)
 
     def explicit_step(self, reach: FloatArray, disturbance: FloatArray) -> float:
         """Longest step of an explicit method, in s, for which the drift is stable; inf if every step is.

@@ -15,6 +15,7 @@ import numpy as np
 from khop_env.compiled import compiled
 from khop_env.elementary import sin, tanh
 from khop_env.physics.agent_model import AgentModel, FloatArray, InputLimit
+from khop_env.physics.growth import Growth, energy_region, ship_growth
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,10 @@ class SingleIntegrator(AgentModel):
     def drift_lipschitz(self) -> float:
         """Zero: there is no drift."""
         return 0.0
+
+    def drift_growth(self, region: FloatArray | None = None) -> Growth:
+        """Two solutions of f = 0 don't part, in any `region`: Lambda = 0."""
+        return Growth(np.zeros((self.n, self.n)), spread=np.zeros(self.n))
 
 
 @compiled
@@ -116,6 +121,14 @@ class DriftingIntegrator(AgentModel):
         """The paper's l_f = 1 (the smallest constant is 1 / sqrt(2))."""
         return 1.0
 
+    def drift_growth(self, region: FloatArray | None = None) -> Growth:
+        """Lambda = 1/2 in all entries, in any `region`.
+
+        tanh((x1 + x2) / 2) has both derivatives sech^2 / 2 in (0, 1/2]; sin((x1 - x2) / 2) has cos / 2 and -cos / 2,
+        within +-1/2. Both values are within +-1, so that they differ by 2 at most.
+        """
+        return Growth(np.full((2, 2), 0.5), spread=np.full(2, 2.0), step=1.0 / 16.0)
+
 
 @dataclass(frozen=True, eq=False)
 class DoubleIntegrator(AgentModel):
@@ -149,6 +162,11 @@ class DoubleIntegrator(AgentModel):
     def drift_lipschitz(self) -> float:
         """The norm of [[0, 1], [0, -damping]]."""
         return math.hypot(1.0, self.damping)
+
+    def drift_growth(self, region: FloatArray | None = None) -> Growth:
+        """The drift is linear, f = Lambda x with Lambda = [[0, I], [0, -damping I]], in any `region`."""
+        matrix = np.block([[np.zeros((2, 2)), np.eye(2)], [np.zeros((2, 2)), -self.damping * np.eye(2)]])
+        return Growth(matrix, step=1.0 / 16.0 / self.damping if self.damping > 0.0 else math.inf)
 
     def explicit_step(self, reach: FloatArray, disturbance: FloatArray) -> float:
         """The time constant 1 / damping: up to it a step of either order never turns a velocity round."""
@@ -187,6 +205,10 @@ class Unicycle(AgentModel):
     def drift_lipschitz(self) -> float:
         """Zero: there is no drift."""
         return 0.0
+
+    def drift_growth(self, region: FloatArray | None = None) -> Growth:
+        """Two solutions of f = 0 don't part, in any `region`: Lambda = 0."""
+        return Growth(np.zeros((self.n, self.n)), spread=np.zeros(self.n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +275,19 @@ class SurfaceVessel(AgentModel):
     def drift_lipschitz(self) -> float:
         """Infinite: the drift is quadratic in the velocities."""
         return math.inf
+
+    def drift_growth(self, region: FloatArray | None = None) -> Growth | None:
+        """`growth.ship_growth` of the velocities within `region`; None without bounds on all three."""
+        region = np.full(6, math.inf) if region is None else region
+        mass, linear, quadratic = (np.array(v) for v in (self.mass, self.linear_drag, self.quadratic_drag))
+        return ship_growth(mass, linear, quadratic, region)
+
+    def operating_region(self, reach: FloatArray, disturbance: FloatArray) -> FloatArray:
+        """Velocities at which drag takes more than full force can give (`growth.energy_region`); any pose."""
+        mass, linear, quadratic = (np.array(v) for v in (self.mass, self.linear_drag, self.quadratic_drag))
+        force = self.input_limit + mass * disturbance[3:]
+        velocities = energy_region(mass, linear, quadratic, force, reach[3:])
+        return np.concatenate([np.full(3, math.inf), velocities])
 
     def explicit_step(self, reach: FloatArray, disturbance: FloatArray) -> float:
         """0.9 / (drag + turning), in s, at the larger of the initial velocities and those at full force.

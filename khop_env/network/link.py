@@ -1,0 +1,58 @@
+"""One link of a network in plain Python: for a process of its own, and the reference for the compiled rounds."""
+
+from __future__ import annotations
+
+from khop_env.network.network import Network
+from khop_env.network.randomness import DELAY, EPISODE, EPISODE_ROUND, LOSS, NOISE, plain_uniform
+
+
+class PlainLink:
+    """A directed link, round by round; bit for bit what `Channel` does with it.
+
+    Args:
+        network: what happens to messages.
+        key: 64-bit key of the environment.
+        number: of the link, in the order of `physics.Links`.
+
+    Attributes:
+        round: the last round, -1 before the first.
+        newest: round in which the newest message that has arrived was sent, -1 for none yet.
+    """
+
+    def __init__(self, network: Network, key: int, number: int) -> None:
+        self.network, self.key, self.number = network, key, number
+        low, high = network.bounds("loss")
+        self._loss = low + (high - low) * plain_uniform(key, EPISODE_ROUND, 0, EPISODE)
+        low, high = network.bounds("latency")
+        self._latency = low + (high - low) * plain_uniform(key, EPISODE_ROUND, 1, EPISODE)
+        self._bad = plain_uniform(key, EPISODE_ROUND, number, LOSS) < self._loss
+        self._flying: list[tuple[int, int]] = []  # (round of arrival, round of sending)
+        self.round = self.newest = -1
+
+    def advance(self, up: bool = True) -> int:
+        """Run a round, in which a link that isn't `up` loses the message; returns `newest`."""
+        self.round += 1
+        self._bad = plain_uniform(self.key, self.round, self.number, LOSS) < self._probability_of_loss()
+        if up and not self._bad:
+            self._flying.append((self.round + self._rounds_late(), self.round))
+        arrived = [sent for arrival, sent in self._flying if arrival <= self.round]
+        self._flying = [(arrival, sent) for arrival, sent in self._flying if arrival > self.round]
+        self.newest = max([self.newest, *arrived])
+        return self.newest
+
+    def _probability_of_loss(self) -> float:
+        if self.network.burst is None:
+            return self._loss
+        recovery = 1.0 / self.network.burst
+        return 1.0 - recovery if self._bad else recovery * self._loss / (1.0 - self._loss)
+
+    def _rounds_late(self) -> int:
+        jitter = self.network.jitter
+        u = plain_uniform(self.key, self.round, self.number, DELAY)
+        delay = self._latency - jitter + 2.0 * jitter * u
+        return min(self.network.most_rounds_late, self.network.rounds_late(delay))
+
+
+def plain_noise(network: Network, key: int, number: int, row: int) -> float:
+    """Measurement error of component `row` of all states, sent in round `number` of the environment with this `key`."""
+    return network.noise * (2.0 * plain_uniform(key, number, row, NOISE) - 1.0)

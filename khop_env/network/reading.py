@@ -1,0 +1,72 @@
+"""Networks and their numbers as users write them."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+Range: TypeAlias = float | tuple[float, float]
+
+
+def split_networks(text: str) -> list[str]:
+    """A list of networks as one text, split at commas; a part "key=value" belongs to the name before it.
+
+        split_networks("ideal,wifi,lossy:loss=0.3,burst=5")     # ["ideal", "wifi", "lossy:loss=0.3,burst=5"]
+
+    Raises:
+        ValueError: for an empty part, or a key=value without a name before it.
+    """
+    found: list[str] = []
+    for part in text.split(","):
+        name, equals, _ = part.partition("=")
+        if not part.strip():
+            raise ValueError(f"networks {text!r}: there is nothing between two commas or at an end")
+        if not equals or ":" in name:
+            found.append(part.strip())
+        elif not found:
+            raise ValueError(f"networks {text!r}: no name before {part!r}; write e.g. 'ideal:{part.strip()}'")
+        else:
+            found[-1] += f"{',' if ':' in found[-1] else ':'}{part.strip()}"
+    return found
+
+
+def parsed(text: str, what: str) -> Range | None:
+    """A number, a range "low..high", or "none"; `what` it is, for error messages.
+
+    Raises:
+        ValueError: for any other text.
+    """
+    if text.lower() == "none":
+        return None
+    try:
+        numbers = [float(part) for part in text.split("..")]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 2:
+        raise ValueError(f"{what} must be a number, or a range like 0.1..0.3; got {text!r}")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def number(value: object, what: str) -> float:
+    """A value that is a number, NumPy's included; `what` it is, for error messages.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise ValueError(f"{what} must be a number; got {value!r}")
+    return float(value)
+
+
+def number_or_range(value: object, what: str) -> Range:
+    """A value that is a number or a pair (low, high), lists included; `what` it is, for error messages.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if not isinstance(value, tuple | list):
+        return number(value, what)
+    if len(value) != 2 or not number(value[0], what) <= number(value[1], what):
+        raise ValueError(f"{what} must be a number, or a range (low, high) with low <= high; got {value!r}")
+    return float(value[0]), float(value[1])
