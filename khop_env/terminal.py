@@ -155,10 +155,10 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
         f"{summary['order']}), {summary['controller']} on {observed}, seed {summary['seed']}"
     )
     ratios = f"|xi|/rho {_ratio(summary['max_normalized_disagreement'])}, "
-    ratios += f"|x_tilde|/delta {_ratio(summary['max_error_to_bound'])}"
+    ratios += f"|x_tilde|/bound {_ratio(summary['max_error_to_bound'])}"
     if summary["max_error_to_bound_input"] is not None:
         ratios += f"; of the inputs |mu|/omega {_ratio(summary['max_normalized_disagreement_input'])}, "
-        ratios += f"|g_tilde|/theta {_ratio(summary['max_error_to_bound_input'])}"
+        ratios += f"|g_tilde|/bound {_ratio(summary['max_error_to_bound_input'])}"
     if summary["funnel_kept"]:
         print_text(f"guarantee kept: largest {ratios} (all below 1)")
         if summary["error"] is not None or summary.get("terminated"):
@@ -204,16 +204,16 @@ def print_design(report: Mapping[str, Any]) -> None:
     """The design report as tables."""
     print_text(
         f"{report['scenario']}: {report['agents']} agents, {report['edges']} edges, k = {report['k']}, "
-        f"{'with' if report['relay'] else 'without'} relay"
+        f"{'with' if report['relay'] else 'without'} relay, design rule {report['design_rule']}"
     )
     targets = report["targets"]
     if targets:
         shown = targets[:SHOWN_TARGETS]
         print_table(
-            ("target", "k-hop set", "eta", "lambda(M)"),
+            ("target", "k-hop set", "eta", "lambda(M)", "bound / delta"),
             [_spectrum_row(target) for target in shown],
-            "Observers, by the agent that they estimate",
-            whole=("target", "lambda(M)"),
+            "Observers, by the agent that they estimate, and their own bounds over delta",
+            whole=("target", "lambda(M)", "bound / delta"),
         )
         typer.echo()
         print_table(
@@ -252,7 +252,8 @@ def _spectrum_row(target: Mapping[str, Any]) -> tuple[str, ...]:
     ids = target["k_hop"]
     members = ", ".join(ids[:_SHOWN_IDS]) + (f" and {len(ids) - _SHOWN_IDS} more" if len(ids) > _SHOWN_IDS else "")
     spectrum = f"{target['lambda_min']:.4g} .. {target['lambda_max']:.4g}"
-    return target["agent"], members, str(target["eta"]), spectrum
+    own = " .. ".join(f"{share:.3f}" for share in dict.fromkeys(target["own_bound"]))
+    return target["agent"], members, str(target["eta"]), spectrum, own
 
 
 def _funnel_rows(target: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:

@@ -6,12 +6,13 @@ The paper's definitions are written out here once more, from the graph alone (ne
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import networkx as nx
 import numpy as np
 from hypothesis import strategies as st
 
-from khop_env.observers import Exponential, Funnels, ObserverDesign, Observers, PairLayout, TargetObservers
+from khop_env.observers import DesignRule, Exponential, Funnels, ObserverDesign, Observers, PairLayout, TargetObservers
 from khop_env.physics import (
     BandLimitedNoise,
     Coupling,
@@ -158,6 +159,7 @@ def systems(
     floor: float = 0.02,
     margin: float = 1.05,
     largest: int = 9,
+    rule: DesignRule | None = None,
 ) -> System:
     """A whole random system.
 
@@ -170,7 +172,9 @@ def systems(
         floor: the smallest bound on an estimation error at steady state.
         margin: how much larger than the smallest feasible one the bounds start, at least.
         largest: number of agents at most.
+        rule: the design rule; drawn if left out.
     """
+    rule = draw(st.sampled_from(get_args(DesignRule))) if rule is None else rule
     graph = draw(connected_graphs(largest=largest))
     k, relay = draw(hops(relay))
     agents = len(graph)
@@ -187,10 +191,10 @@ def systems(
     rng = np.random.default_rng(seed)
     initial = InitialSet(rng.uniform(-2.0, 2.0, fleet.n), rng.uniform(0.0, 1.5, fleet.n))
     anything = Exponential(1.0, 1.0, 1.0)
-    probe = ObserverDesign(fleet, graph, k, anything, anything, relay, options)
+    probe = ObserverDesign(fleet, graph, k, anything, anything, relay, options, rule)
     deltas = fitting(probe.states, initial.radius, rng, floor, margin)
     thetas = fitting(probe.inputs, fleet.input_map_bound, rng, 5.0 * floor, margin)
-    design = ObserverDesign(fleet, graph, k, deltas, thetas, relay, options)
+    design = ObserverDesign(fleet, graph, k, deltas, thetas, relay, options, rule)
     disturbance = Sum(
         (
             Sinusoid(rng.uniform(0.0, 0.5)),

@@ -276,7 +276,7 @@ class TestRun:
 
     @pytest.mark.parametrize(("name", "expected"), [("..", "scenario"), ("a: b", "a_b"), (".hidden", "hidden")])
     def test_the_folder_stays_within_runs(self, folder, name, expected):
-        (folder / "mine.toml").write_text(khop("export", "paper").stdout.replace('"paper"', f'"{name}"'))
+        (folder / "mine.toml").write_text(khop("export", "paper").stdout.replace('name = "paper"', f'name = "{name}"'))
         khop("run", "mine.toml", "--duration", "0.02")
         assert [path.name for path in folder.iterdir() if path.is_dir()] == ["runs"]
         assert [path.name for path in (folder / "runs").iterdir()] == [f"{expected}-tanh-estimate-seed0"]

@@ -38,7 +38,7 @@ def test_the_file_that_a_run_writes_repeats_it(folder):
     options = ("--config", "tiny.toml", "--env", "control_period=0.1", "--env", "reward=team", "--env", "dt=none")
     first = only_json(khop("train", "consensus_v0", "--scenario", "mine.toml", *options, "--out", "a", "--json"))
     text = (folder / "a" / "config.toml").read_text()
-    assert "# number of environments, each with N agents.\nnum_envs = 2\n" in text
+    assert "# copies of the environment, each of N agents.\nnum_envs = 2\n" in text
     assert "in its unit" in text  # of the task error
     values = tomllib.loads(text)
     assert set(first["config"]) == set(values)

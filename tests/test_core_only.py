@@ -46,7 +46,9 @@ def core(tmp_path_factory):
     def python(*arguments: str) -> subprocess.CompletedProcess:
         return subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True)
 
-    (folder / "my_file.py").write_text("from khop_env.consensus_v0 import parallel_env as make_env\n")
+    (folder / "my_file.py").write_text(
+        "from khop_env.consensus_v0 import parallel_env as make_env\nfrom khop_env.tasks import Consensus as MyTask\n"
+    )
     (folder / "mine.toml").write_text(python("-m", "khop_env", "export", "paper").stdout)
     return python
 

@@ -134,10 +134,10 @@ class _Run(BaseCallback):
         folder: Path | None,
         saved: Mapping[str, Any] | None,
         on_progress: OnProgress | None,
-        asked: TrainingConfig,
+        asked: TrainingConfig | None = None,
     ) -> None:
         super().__init__()
-        self.asked = asked  # with the scenario as the user names it
+        self.asked = asked or config  # with the scenario as the user names it
         self.config, self.folder, self.on_progress = config, folder, on_progress
         self.env: VecNormalize = training_environment(config)
         self.learner: TrainingVecEnv = self.env.venv  # type: ignore[assignment]

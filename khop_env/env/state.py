@@ -24,8 +24,8 @@ SHARED_INFOS = (
     "clipped_observations",
     "clipped_actions",
 )
-"""Keys of every info beside the task's own: the largest |xi| / rho and |x_tilde| / delta (inputs: |mu| / omega,
-|g_tilde| / theta) of all observers since the last action, below 1 by guarantee; entries of this agent's observation and
+"""Keys of every info beside the task's own: the largest |xi| / rho, and error over the observer's own bound, of all
+observers of states and inputs since the last action, below 1 by guarantee; entries of this agent's observation and
 action that were clipped."""
 
 Infos = dict[str, NDArray[Any]]
@@ -86,6 +86,7 @@ def signature(
         "control periods": (steps,),
         "disturbances": ("none" if disturbance is None else described(disturbance),),
         "bounds": tuple(bounds),
+        "design rules": (design.design_rule,),
         "numbers of hops": (f"k = {design.k}",),
     }
 

@@ -14,7 +14,14 @@ from khop_env.observers.base import (
     PlantState,
     SolveError,
 )
-from khop_env.observers.design import Bound, DesignError, Funnels, ObserverDesign, TargetObservers
+from khop_env.observers.design import (
+    Bound,
+    DesignError,
+    DesignRule,
+    Funnels,
+    ObserverDesign,
+    TargetObservers,
+)
 from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
 from khop_env.observers.messages import MessagePassing
@@ -27,6 +34,7 @@ __all__ = [
     "Certified",
     "Derivative",
     "DesignError",
+    "DesignRule",
     "Explicit",
     "Exponential",
     "Extremes",

@@ -155,9 +155,9 @@ class Extremes(NamedTuple):
 
     Attributes:
         normalized: (B,) largest |xi| / rho over pairs, components and steps.
-        relative: (B,) largest |x_tilde| / delta.
+        relative: (B,) largest |x_tilde_a| / [M_i^-1 rho_i]_a, the error of an observer over its own guaranteed bound.
         input_normalized: (B,) largest |mu| / omega.
-        input_relative: (B,) largest |g_tilde| / theta.
+        input_relative: (B,) likewise of input maps.
     """
 
     normalized: FloatArray
@@ -213,7 +213,7 @@ class FunnelObservers:
         """Allocate the buffers for steps of `design` in `num_envs` environments."""
         self.design, self.num_envs = design, num_envs
         self.rho, self.omega = WidthsNow(design.states.rho, num_envs), WidthsNow(design.inputs.rho, num_envs)
-        self._error_bound = WidthsNow(design.states.error_bounds, num_envs)
+        self._delta = WidthsNow(design.states.delta, num_envs)
 
     def allocate(self) -> Memory:
         """Estimates of states (P, B) and of the inputs' effects (Q, B)."""
@@ -229,12 +229,11 @@ class FunnelObservers:
             values[:, env_ids] = guess
 
     def bound(self, state: PlantState, out: FloatArray) -> Certified:
-        """Delta, which the design rule guarantees while every disagreement is inside its funnel (Problem 2)."""
-        out[...] = self._error_bound.at(state.t)
-        return Certified(out, self.basis)
+        """Each observer's own bound [M_i^-1 rho_i]_a, guaranteed while every disagreement is inside its funnel."""
+        return Certified(self.design.states.error_bounds(self._delta.at(state.t), out), self.basis)
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
-        """Raise running maxima of |xi| / rho and |x_tilde| / delta, and of the same for inputs, to those of a state."""
+        """Raise running maxima of |xi| / rho and errors over own bounds, and of the same for inputs, to a state's."""
         memory = state.memory
         for funnels, widths, estimate, source, normalized, relative in (
             (
@@ -256,4 +255,12 @@ class FunnelObservers:
         ):
             if funnels.layout.size:
                 rho = widths.at(state.t)
-                largest_ratios(funnels.layout.packed, estimate, source, rho, funnels.gain, normalized, relative)
+                largest_ratios(
+                    funnels.layout.packed,
+                    estimate,
+                    source,
+                    rho,
+                    funnels.layout.inverse_row_sums,
+                    normalized,
+                    relative,
+                )

@@ -1,9 +1,14 @@
 """The design rule: from bounds on the estimation errors (delta, theta) to funnels on the disagreements (rho, omega).
 
-The norm of the funnels of one target may be at most lambda_min(M_i) times the smallest of its observers' bounds
-(Problem 2 of the paper). With one bound delta_i per target and component, all its eta_i observers get
+Disagreements and errors of the observers of target i obey xi = M_i x_tilde. With one bound delta_i per target and
+component, all its eta_i observers get one funnel, by one of two rules:
 
-    rho_i(t) = lambda_min(M_i) / sqrt(eta_i) * delta_i(t).
+    "paper":  rho_i(t) = lambda_min(M_i) / sqrt(eta_i) delta_i(t)   (Problem 2: |rho_i| <= lambda_min(M_i) delta_i)
+    "sharp":  rho_i(t) = delta_i(t) / max_a [M_i^-1 1]_a            (the widest: docs/theory_graphs.md)
+
+Either way M_i^-1 >= 0 entry by entry, so that |xi| < rho_i bounds the error of each observer a by its own number
+
+    |x_tilde_a| < [M_i^-1 1]_a rho_i(t) <= delta_i(t).
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal, get_args
 
 import networkx as nx
 import numpy as np
@@ -28,9 +34,22 @@ Bound = PerformanceFunction | Sequence[PerformanceFunction]
 All observers of a target share it; bounds that differ between observers go through `lower_bound` first.
 """
 
+DesignRule = Literal["paper", "sharp"]
+"""From a bound on errors to a funnel: the paper's sufficient rule, or the widest funnel with the same guarantee."""
+
 
 class DesignError(ValueError):
     """The observers can't be designed with these arguments; the message names a value that is feasible."""
+
+
+def require_design_rule(rule: object) -> None:
+    """Refuse an unknown design rule.
+
+    Raises:
+        ValueError: naming it and the known ones.
+    """
+    if not isinstance(rule, str) or rule not in get_args(DesignRule):
+        raise ValueError(f"design_rule must be one of {', '.join(get_args(DesignRule))}; got {rule!r}")
 
 
 @dataclass(frozen=True)
@@ -54,18 +73,33 @@ class Funnels:
     Attributes:
         layout: the pairs (observer, target).
         bounds: per row of the layout, delta (or theta): the bound on the estimation error.
+        rule: the design rule.
     """
 
     layout: PairLayout
     bounds: tuple[PerformanceFunction, ...]
+    rule: DesignRule = "paper"
 
     __repr__ = brief
 
     @cached_property
     def gain(self) -> FloatArray:
-        """(rows,) lambda_min(M_i) / sqrt(eta_i) of each row's target: the design rule's factor on delta."""
-        per_target = self.layout.eigenvalues[:, 0] / np.sqrt(self.layout.arrays.observers)
-        return per_target[self.layout.row_target]
+        """(rows,) the design rule's factor on delta: lambda_min(M_i) / sqrt(eta_i), or 1 / max_a [M_i^-1 1]_a."""
+        layout = self.layout
+        if self.rule == "paper":
+            per_target = layout.eigenvalues[:, 0] / np.sqrt(layout.arrays.observers)
+        else:
+            largest = [layout.inverse_row_sums[block.pairs].max() for block in layout.blocks]
+            per_target = 1.0 / np.array(largest, float)
+        return per_target[layout.row_target]
+
+    @cached_property
+    def share(self) -> FloatArray:
+        """(pairs,) each observer's own guaranteed bound [M_i^-1 1]_a rho_i, as a fraction of delta_i."""
+        layout = self.layout
+        per_target = self.gain[layout.arrays.row]  # equal for all components
+        # at most 1, but for rounding
+        return np.minimum(np.repeat(per_target, layout.arrays.observers) * layout.inverse_row_sums, 1.0)
 
     @cached_property
     def delta(self) -> FunnelBank:
@@ -77,10 +111,15 @@ class Funnels:
         """The funnels on the disagreements that the design rule gives, row by row."""
         return FunnelBank([scaled(bound, gain) for bound, gain in zip(self.bounds, self.gain, strict=True)])
 
-    @cached_property
-    def error_bounds(self) -> FunnelBank:
-        """The guaranteed bound on the error of every estimate, in the order of the layout's (P,) vector."""
-        return FunnelBank([self.bounds[row] for row in self.layout.column_row])
+    def error_bounds(self, delta: FloatArray, out: FloatArray) -> FloatArray:
+        """The guaranteed bound on the error of every estimate: its observer's own share of delta.
+
+        Args:
+            delta: (rows, B) values of `delta`.
+            out: (P, B), written and returned; never above delta.
+        """
+        np.take(delta, self.layout.column_row, axis=0, out=out, mode="clip")  # the default mode copies `out` first
+        return np.multiply(out, self.share[self.layout.column_pair, None], out=out)
 
     def largest_relay(self) -> FloatArray:
         """(rows,) h_max: with one common first guess c the disagreement starts as xi = H (c - x_i)."""
@@ -130,11 +169,12 @@ class ObserverDesign:
             too, from the target's own messages (the paper's remarks).
         targets: per agent the options of its observers; `TargetObservers()` by default, without the input observer
             where the input map depends on the state.
+        design_rule: from delta to the funnels, "paper" or "sharp".
 
     Raises:
         DesignError: an input observer for an agent whose g depends on its state, none for an agent whose g is
             unbounded, or a bound that is missing or of a wrong length.
-        ValueError: a graph that isn't undirected, connected and labelled 0..N-1.
+        ValueError: a graph that isn't undirected, connected and labelled 0..N-1, or an unknown design rule.
     """
 
     fleet: Fleet
@@ -144,6 +184,7 @@ class ObserverDesign:
     theta: PerformanceFunction | Mapping[int, Bound] | None = None
     relay: bool = True
     targets: Sequence[TargetObservers] | None = None
+    design_rule: DesignRule = "paper"
     links: Links = field(init=False)
     neighborhoods: tuple[tuple[int, ...], ...] = field(init=False)
     options: tuple[TargetObservers, ...] = field(init=False)
@@ -153,6 +194,7 @@ class ObserverDesign:
     def __post_init__(self) -> None:
         fleet = self.fleet
         validate_graph(self.communication, len(fleet))
+        require_design_rule(self.design_rule)
         options = self.targets or [TargetObservers(input_observer=not m.input_map_uses_state) for m in fleet.models]
         if len(options) != len(fleet):
             raise DesignError(f"targets has {len(options)} entries, the fleet {len(fleet)} agents; give one per agent")
@@ -183,8 +225,8 @@ class ObserverDesign:
             "links": links,
             "neighborhoods": neighborhoods,
             "options": tuple(options),
-            "states": Funnels(states, self._rows(states, self.delta, "delta")),
-            "inputs": Funnels(inputs, self._rows(inputs, self.theta, "theta")),
+            "states": Funnels(states, self._rows(states, self.delta, "delta"), self.design_rule),
+            "inputs": Funnels(inputs, self._rows(inputs, self.theta, "theta"), self.design_rule),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -206,8 +248,8 @@ class ObserverDesign:
         for name, value in (
             ("delta", delta),
             ("theta", theta),
-            ("states", Funnels(self.states.layout, self._rows(self.states.layout, delta, "delta"))),
-            ("inputs", Funnels(self.inputs.layout, self._rows(self.inputs.layout, theta, "theta"))),
+            ("states", Funnels(self.states.layout, self._rows(self.states.layout, delta, "delta"), self.design_rule)),
+            ("inputs", Funnels(self.inputs.layout, self._rows(self.inputs.layout, theta, "theta"), self.design_rule)),
         ):
             object.__setattr__(other, name, value)
         return other

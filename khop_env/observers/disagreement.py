@@ -108,20 +108,20 @@ def largest_ratios(
     estimate: FloatArray,
     source: FloatArray,
     rho: FloatArray,
-    gain: FloatArray,
+    inverse_row_sums: FloatArray,
     normalized: FloatArray,
     relative: FloatArray,
 ) -> None:
-    """Raise running maxima to the largest |xi| / rho and |x_tilde| / delta over all pairs and components.
+    """Raise running maxima to the largest |xi| / rho and |x_tilde| / (M^-1 rho) over all pairs and components.
 
     Args:
         pairs: `PairLayout.packed`.
         estimate: (P, B) estimates.
         source: (n, B) the true values.
         rho: (rows, B) funnels.
-        gain: (rows,) the design rule's rho / delta.
+        inverse_row_sums: (pairs,) [M_i^-1 1]_a.
         normalized: (B,) running maxima of |xi| / rho; inf where a number isn't finite.
-        relative: (B,) running maxima of |x_tilde| / delta.
+        relative: (B,) running maxima of |x_tilde_a| / ([M_i^-1 1]_a rho_i).
     """
     pairs = PairArrays(*pairs)
     batch = estimate.shape[1]
@@ -131,6 +131,7 @@ def largest_ratios(
         offset, origin, row = pairs.column[t], pairs.source[t], pairs.row[t]
         for a in range(eta):
             d, h = pairs.diagonal[pair + a], pairs.relay[pair + a]
+            factor = 1.0 / inverse_row_sums[pair + a]
             for c in range(n):
                 column = offset + a * n + c
                 for env in range(batch):
@@ -139,7 +140,6 @@ def largest_ratios(
                     other = offset + pairs.entry[k] * n + c
                     for env in range(batch):
                         xi[env] -= estimate[other, env]
-                factor = gain[row + c]
                 for env in range(batch):
                     scale = 1.0 / rho[row + c, env]
                     ratio = abs(xi[env]) * scale

@@ -6,7 +6,7 @@ target by target, within a target observer by observer, within an observer compo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -260,7 +260,26 @@ class PairLayout:
 
     @cached_property
     def eigenvalues(self) -> FloatArray:
-        """(targets, 2): smallest and largest eigenvalue of each M_i; equal matrices, as those of a star, count once."""
+        """(targets, 2): smallest and largest eigenvalue of each M_i."""
+        extremes = np.zeros((len(self.target), 2))
+        for groups, matrices in self._distinct_matrices():
+            for members, values in zip(groups, np.linalg.eigvalsh(matrices), strict=True):
+                extremes[members] = values[[0, -1]]
+        return extremes
+
+    @cached_property
+    def inverse_row_sums(self) -> FloatArray:
+        """(pairs,) [M_i^-1 1]_a: |x_tilde_a| is below this many times rho where all disagreements are within rho."""
+        sums = np.zeros(self.pairs)
+        for groups, matrices in self._distinct_matrices():
+            found = np.linalg.solve(matrices, np.ones((*matrices.shape[:2], 1)))[..., 0]
+            for members, values in zip(groups, found, strict=True):
+                for index in members:
+                    sums[self.blocks[index].pairs] = values
+        return sums
+
+    def _distinct_matrices(self) -> Iterator[tuple[list[list[int]], FloatArray]]:
+        """Stacks of the matrices M_i, each with the targets that share it: those of a star, say, are all equal."""
         alike: dict[tuple[bytes, ...], list[int]] = {}
         arrays = self.arrays
         for index, block in enumerate(self.blocks):
@@ -269,17 +288,12 @@ class PairLayout:
             alike.setdefault(tuple(part.tobytes() for part in content), []).append(index)
         groups = list(alike.values())
         sizes = arrays.observers[[members[0] for members in groups]]
-        extremes = np.zeros((len(self.target), 2))
         for eta in np.unique(sizes):
             same = [groups[number] for number in np.flatnonzero(sizes == eta)]
-            # eigvalsh takes a stack; slices bound its memory with ten thousand targets
-            step = max(1, 1_000_000 // int(eta) ** 2)
+            step = max(1, 1_000_000 // int(eta) ** 2)  # slices bound the memory with ten thousand targets
             for first in range(0, len(same), step):
                 some = same[first : first + step]
-                spectrum = np.linalg.eigvalsh(np.stack([self.matrix(members[0]) for members in some]))
-                for members, values in zip(some, spectrum, strict=True):
-                    extremes[members] = values[[0, -1]]
-        return extremes
+                yield some, np.stack([self.matrix(members[0]) for members in some])
 
 
 def _joined(parts: Iterable[IntArray]) -> IntArray:

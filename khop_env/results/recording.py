@@ -69,12 +69,20 @@ class ObserverRecord:
 
     @property
     def delta(self) -> FloatArray:
-        """(T, P) bounds on the estimation errors: delta, or theta."""
+        """(T, P) bounds on the estimation errors that the observers were designed for: delta, or theta."""
         return self._evaluate(self.funnels.delta)
 
+    @property
+    def bound(self) -> FloatArray:
+        """(T, P) each observer's own guaranteed bound on the error; at most delta, or theta."""
+        out = np.empty((self.funnels.layout.size, len(self.time)))
+        return self.funnels.error_bounds(self._rows(self.funnels.delta), out).T
+
     def _evaluate(self, bank: FunnelBank) -> FloatArray:
-        layout = self.funnels.layout
-        return bank.evaluate(self.time, np.empty((layout.rows, len(self.time)))).T[:, layout.column_row]
+        return self._rows(bank).T[:, self.funnels.layout.column_row]
+
+    def _rows(self, bank: FunnelBank) -> FloatArray:
+        return bank.evaluate(self.time, np.empty((len(bank), len(self.time))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,12 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
     Returns:
         feasible: True if all conditions of the observers that can be checked before the start hold; otherwise `error`
             names the violated condition.
-        targets: per estimated agent: its k-hop set, eta, lambda_min and lambda_max of M_i, and under `state` and
-            `input` per group of components with equal bounds: delta and rho (theta and omega), each with initial and
-            final value and rate, and start_share, the largest |xi(0)| / rho(0) over the initial set; null if |g| is
-            unbounded, so that only `Simulator.reset` can check it.
+        design_rule: from the bounds delta and theta to the funnels rho and omega.
+        targets: per estimated agent: its k-hop set, eta, lambda_min and lambda_max of M_i, own_bound, the smallest and
+            the largest of its observers' own guaranteed bounds over delta (theta), and under `state` and `input` per
+            group of components with equal numbers: delta and rho (theta and omega), each with initial and final value
+            and rate, and start_share, the largest |xi(0)| / rho(0) over the initial set; null if |g| is unbounded, so
+            that only `Simulator.reset` can check it.
         pairs: number of observer-target pairs; estimates: number of estimated components.
         explicit_step_bound_s: upper bound on stable explicit Euler steps at steady state (accurate steps are far
             shorter): the smallest over all targets, for both kinds of observers.
@@ -38,6 +40,7 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         "edges": scenario.communication.number_of_edges(),
         "k": scenario.k,
         "relay": scenario.relay,
+        "design_rule": scenario.design_rule,
         "feasible": False,
         "error": None,
         "pairs": None,
@@ -128,6 +131,7 @@ def _kinds(design: ObserverDesign) -> tuple[tuple[str, Funnels], tuple[str, Funn
 
 def _targets(design: ObserverDesign) -> dict[int, dict[str, Any]]:
     layout, ids = design.states.layout, design.fleet.ids
+    shares = [design.states.share[block.pairs] for block in layout.blocks]
     return {
         i: {
             "agent": ids[i],
@@ -135,11 +139,14 @@ def _targets(design: ObserverDesign) -> dict[int, dict[str, Any]]:
             "eta": len(design.neighborhoods[i]),
             "lambda_min": smallest,
             "lambda_max": largest,
+            "own_bound": [float(share.min()), float(share.max())],
             "drift_known": design.options[i].drift,
             "state": [],
             "input": [],
         }
-        for i, (smallest, largest) in zip(layout.target.tolist(), layout.eigenvalues.tolist(), strict=True)
+        for i, (smallest, largest), share in zip(
+            layout.target.tolist(), layout.eigenvalues.tolist(), shares, strict=True
+        )
     }
 
 

@@ -29,7 +29,8 @@ def estimates_table(recording: Recording) -> pl.DataFrame:
         error: estimate - state.
         disagreement: xi, or mu for inputs.
         rho: the funnel of the disagreement; omega for inputs.
-        delta: the bound on the estimation error; theta for inputs.
+        delta: the bound on the estimation error that was designed for; theta for inputs.
+        bound: this observer's own guaranteed bound on the error, at most delta (theta).
     """
     import polars as pl
 
@@ -87,6 +88,7 @@ def _estimates(recording: Recording, quantity: str, kind: ObserverRecord) -> pl.
             "disagreement": kind.disagreement.ravel(),
             "rho": kind.rho.ravel(),
             "delta": kind.delta.ravel(),
+            "bound": kind.bound.ravel(),
         }
     )
 

@@ -37,6 +37,7 @@ def write_scenario(scenario: Scenario) -> str:
         ("description", None),
         ("k", "agents up to k hops away are estimated"),
         ("relay", "whether agents relay their neighbours' states (Assumption 4)"),
+        ("design_rule", "from delta to the funnels: paper, or sharp for the widest ones"),
         ("duration", "s"),
         ("dt", "s, step of the proximal integrator"),
         ("order", "its order, 1 or 2"),

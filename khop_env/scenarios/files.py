@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, get_type_hints
 import networkx as nx
 import numpy as np
 
-from khop_env.observers import Bound, DesignError, Exponential, FloatArray, TargetObservers
+from khop_env.observers import Bound, DesignError, DesignRule, Exponential, FloatArray, TargetObservers
 from khop_env.physics import (
     DISTURBANCES,
     MODELS,
@@ -74,6 +74,7 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
         "name": root.take("name", str),
         "description": root.take("description", str, ""),
         "k": root.take("k", int),
+        "design_rule": root.take("design_rule", DesignRule, defaults["design_rule"]),
         **{key: root.take(key, type(defaults[key]), defaults[key]) for key in ("relay", "duration", "dt", "order")},
         "figure_agent": root.take("figure_agent", int, None),
     }

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from khop_env.observers import (
     Bound,
     DesignError,
+    DesignRule,
     Exponential,
     ObserverDesign,
     Observers,
@@ -22,6 +23,7 @@ from khop_env.observers import (
     Proximal,
     TargetObservers,
 )
+from khop_env.observers.design import require_design_rule
 from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
 from khop_env.simulation import InitialSet, Law, Observe, Simulator
 
@@ -56,6 +58,7 @@ class Scenario:
         relay: whether agents relay their neighbours' states (the paper's Assumption 4).
         delta: bounds on the state estimation errors.
         theta: bounds on the input estimation errors, where there are input observers.
+        design_rule: from these bounds to the funnels on the disagreements: "paper", or "sharp" for the widest ones.
         observers: per agent the options of its observers; None for the default of `ObserverDesign`.
         disturbance: w_i(x, t), or None.
         center: (n,) centre of the box that states start in, and the observers' first guess.
@@ -78,6 +81,7 @@ class Scenario:
     k: int
     delta: Bounds
     theta: Bounds | None = None
+    design_rule: DesignRule = "paper"
     relay: bool = True
     observers: tuple[TargetObservers, ...] | None = None
     disturbance: Disturbance | None = None
@@ -123,6 +127,10 @@ class Scenario:
             for value in values:
                 if not isinstance(value, bool | np.bool):
                     raise ValueError(f"scenario {self.name!r}: {what} must be True or False; got {value!r}")
+        try:
+            require_design_rule(self.design_rule)
+        except ValueError as error:
+            raise ValueError(f"scenario {self.name!r}: {error}") from None
         if self.order not in (1, 2):
             raise ValueError(f"scenario {self.name!r}: order must be 1 or 2; got {self.order!r}")
         if not 0 < len(self.models) <= MOST_AGENTS:
@@ -195,6 +203,7 @@ class Scenario:
             None if self.theta is None else self._per_agent(self.theta, "theta"),
             self.relay,
             self.observers,
+            self.design_rule,
         )
         for name, funnels in (("delta", design.states), ("theta", design.inputs)):
             for bound in {id(f): f for f in funnels.bounds if not isinstance(f, Exponential)}.values():

@@ -172,10 +172,30 @@ EVALUATE = ("evaluate", "consensus_v0", "--policies", "zero", "--observe", "esti
 @pytest.mark.parametrize(
     ("arguments", "calls", "printed", "said"),
     [
-        ((*EVALUATE, "--workers", "2", "--json"), 3, '"episodes": ', "interrupted; above is what was played"),
-        ((*EVALUATE, "--csv"), 2, "consensus_v0,paper,estimate,zero,49,", "interrupted; above is what was played"),
-        (("tune", "consensus_v0", "--policies", "leader_following"), 2, "}  # interrupted\n", "was found until then"),
-        (("iss", "paper", "--duration", "3", "--episodes", "2"), 5, "0.02 ", "above is what was measured until then"),
+        (
+            (*EVALUATE, "--workers", "2", "--json"),
+            3,
+            '"episodes": ',
+            "interrupted; above are the episodes that were played",
+        ),
+        (
+            (*EVALUATE, "--csv"),
+            2,
+            "consensus_v0,paper,estimate,zero,49,",
+            "interrupted; above are the episodes that were played",
+        ),
+        (
+            ("tune", "consensus_v0", "--policies", "leader_following"),
+            2,
+            "}  # interrupted\n",
+            "above are the parameters that were found until then",
+        ),
+        (
+            ("iss", "paper", "--duration", "3", "--episodes", "2"),
+            5,
+            "0.02 ",
+            "above are the rows that were measured until then",
+        ),
     ],
     ids=["workers", "evaluate", "tune", "iss"],
 )
@@ -222,10 +242,10 @@ def test_a_killed_worker_on_the_command_line(monkeypatch):
     result = CliRunner().invoke(app, [*EVALUATE, "--workers", "2"])
     assert result.exit_code == 2
     assert result.stderr == (
-        "khop: a worker process was killed by SIGKILL (use fewer workers if memory is short); above is what was played "
-        "until then\n"
+        "khop: a worker process was killed by SIGKILL (use fewer workers if memory is short); above are the episodes "
+        "that were played until then\n"
     )
-    assert re.search(r"zero \(\d+ episodes\)", result.stdout)
+    assert re.search(r"^zero on estimate .*^\(\d+ episodes\) ", result.stdout, re.DOTALL | re.MULTILINE)
 
 
 def test_a_policy_that_fails_on_the_way(monkeypatch):

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.env.playing import EVERY, batched, built, parallel, play
+from tests.strategies import definition_of_m
 
 every = pytest.mark.parametrize(("environment", "name"), EVERY)
 uniform_or_ragged = pytest.mark.parametrize("uniform", [True, False])
@@ -63,12 +64,15 @@ def known_state(env, i, j, hops):
     return simulator.estimates[0, first : first + len(truth)]
 
 
-def delta(env, j):
-    """The bounds on the errors of estimates of agent j, one per state, from the scenario's functions."""
+def own_bounds(env, i, j):
+    """[M_j^-1 rho_j]_i, the bounds on the errors of agent i's estimate of j, one per state, from the definitions."""
     simulator, model = env.batched.simulator, env.batched.fleet.models[j]
-    layout = simulator.design.states.layout
+    design, layout = simulator.design, simulator.design.states.layout
+    members = list(design.neighborhoods[j])
+    m = definition_of_m(design.communication, members, j, design.relay)
+    share = np.linalg.eigvalsh(m)[0] / np.sqrt(len(m)) * np.linalg.inv(m).sum(axis=1)[members.index(i)]
     rows = [int(np.flatnonzero(layout.row_source == env.batched.fleet.state_offset[j] + c)[0]) for c in range(model.n)]
-    return [float(simulator.design.states.bounds[row](simulator.t)[0]) for row in rows]
+    return [share * float(design.states.bounds[row](simulator.t)[0]) for row in rows]
 
 
 def expected_slot(env, i, number, j, hops, wanted):
@@ -96,7 +100,7 @@ def expected_slot(env, i, number, j, hops, wanted):
         values[f"{name}.position.{axis}"] = known[model.position_index[c]] - own[c]
     values |= expected_state(model, known, name)
     if env.batched.settings.bounds:
-        bounds = np.zeros(model.n) if hops[j] == 1 else delta(env, j)
+        bounds = np.zeros(model.n) if hops[j] == 1 else own_bounds(env, i, j)
         values |= {f"{name}.bound.{state}": bound for state, bound in zip(model.states, bounds, strict=True)}
     return values
 

@@ -22,6 +22,7 @@ from khop_env.env.rendering.scene import (
 from khop_env.observers import Exponential, ObserverDesign
 from khop_env.physics import DoubleIntegrator, DriftingIntegrator, Fleet, SingleIntegrator, SurfaceVessel, Unicycle
 from tests.env.drawing import DELTA, TASK, design, renderer, scene
+from tests.strategies import definition_of_m
 
 
 def rgb(color: str) -> np.ndarray:
@@ -75,7 +76,7 @@ class TestFrame:
 
     @pytest.mark.parametrize("t", [0.8, 1.0, 9.0])
     def test_boxes_are_as_wide_as_the_bound(self, t):
-        """Agent 0's estimate of agent 2 is 0.2 m off; the bound's edges are delta(t) from the estimate."""
+        """Agent 0's estimate of agent 2 is 0.2 m off; the bound's edges are delta(t) from the estimate: eta = 1."""
         drawn = renderer(observer=0)
         frame = drawn.frame(*scene(t, offset=0.2))
         estimated, delta = np.array([1.2, -1.8]), DELTA(t)
@@ -172,9 +173,14 @@ class TestWhoIsShown:
                 estimated = dict(zip(fleet.models[j].states, estimates[start:], strict=False))
                 assert drawn.positions(estimates)[number].tolist() == [estimated["x"], estimated["y"]]
                 assert drawn.headings(estimates)[number] == estimated.get("heading", 0.0)
-                expected = [float(bounds[j][c](2.0)) for c in (0, 1)]
+                members = list(mixed.neighborhoods[j])
+                m = definition_of_m(mixed.communication, members, j, True)
+                share = np.linalg.eigvalsh(m)[0] / np.sqrt(len(m)) * np.linalg.inv(m).sum(axis=1)
+                own = share[members.index(observer)]
+                expected = [own * float(bounds[j][c](2.0)) for c in (0, 1)]
                 assert drawn.half_widths(2.0)[number] == pytest.approx(expected, rel=1e-12)
-                assert drawn.final_half_widths()[number].tolist() == [bounds[j][c].final for c in (0, 1)]
+                expected = [own * bounds[j][c].final for c in (0, 1)]
+                assert drawn.final_half_widths()[number] == pytest.approx(expected, rel=1e-12)
 
     def test_no_such_agent(self):
         with pytest.raises(ValueError, match="no agent 7"):

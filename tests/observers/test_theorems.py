@@ -22,23 +22,28 @@ BOTH = pytest.mark.parametrize("integrator", ["proximal", "explicit"])
 
 
 class Bounds:
-    """delta and rho of every estimate, and M, from the system's graph and the functions it was given."""
+    """delta, rho and own bound of every estimate, and M, from the graph and the functions that it was given."""
 
     def __init__(self, system: System, layout: PairLayout, given_bounds: dict) -> None:
         graph, relay = system.design.communication, system.design.relay
         self.m = np.zeros((layout.size, layout.size))
-        columns = []
+        columns, self.own = [], np.zeros(layout.size)
         for index, block in enumerate(layout.blocks):
             m = definition_of_m(graph, observers_of(layout, index), block.agent, relay)
             self.m[block.columns, block.columns] = np.kron(m, np.eye(block.components))
+            sums = np.linalg.inv(m).sum(axis=1)
             gain = np.linalg.eigvalsh(m)[0] / np.sqrt(block.observers)
+            gain = gain if system.design.design_rule == "paper" else 1.0 / sums.max()
+            self.own[block.columns] = np.repeat(sums * gain, block.components)
             columns += block.observers * [(f.initial, f.final, f.rate, gain) for f in given_bounds[block.agent]]
         self.initial, self.final, self.rate, self.gain = np.array(columns).reshape(-1, 4).T
 
     def check(self, t: float, error: np.ndarray, difference: np.ndarray) -> None:
-        """|x_tilde| < delta(t), |xi| < rho(t) = lambda_min / sqrt(eta) delta(t), and xi = M x_tilde."""
+        """|x_tilde| < M^-1 rho <= delta(t), |xi| < rho(t) by the design rule, and xi = M x_tilde."""
         delta = (self.initial - self.final) * np.exp(-self.rate * t) + self.final
-        assert np.all(np.abs(error) < delta), f"t = {t}: {np.max(np.abs(error) / delta)}"
+        assert np.all(self.own <= 1.0 + 1e-12)
+        own = self.own * delta
+        assert np.all(np.abs(error) < own), f"t = {t}: {np.max(np.abs(error) / own)}"
         assert np.all(np.abs(difference) < self.gain * delta), (
             f"t = {t}: {np.max(np.abs(difference) / self.gain / delta)}"
         )

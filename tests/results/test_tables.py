@@ -6,9 +6,10 @@ from agents import make_law
 from khop_env.results import estimates_table, record, states_table
 from khop_env.scenarios import paper
 from khop_env.scenarios.mixed_fleet import mixed_fleet
+from tests.strategies import definition_of_m
 
 COLUMNS = ["quantity", "time", "target", "observer", "component"]
-COLUMNS += ["state", "estimate", "error", "disagreement", "rho", "delta"]
+COLUMNS += ["state", "estimate", "error", "disagreement", "rho", "delta", "bound"]
 
 
 @pytest.fixture(scope="module", params=[paper, mixed_fleet])
@@ -28,7 +29,7 @@ def test_estimates_columns(table, recording):
     assert len(table) == len(recording.time) * (design.states.layout.size + design.inputs.layout.size)
     assert table.null_count().sum_horizontal().item() == 0
     numbers = table.select(pl.col(pl.Float64))
-    assert numbers.width == 7
+    assert numbers.width == 8
     assert np.isfinite(numbers.to_numpy()).all()
     assert table.select(COLUMNS[:5]).is_unique().all()
 
@@ -56,6 +57,12 @@ def test_each_estimate_stands_beside_its_own_truth(table, recording):
             assert row["disagreement"] == kind.disagreement[sample, column]
             assert row["rho"] == pytest.approx(float(funnel(row["time"])), rel=1e-12)
             assert row["delta"] == pytest.approx(float(bound(row["time"])), rel=1e-12)
+            members = list(design.neighborhoods[target])
+            m = definition_of_m(design.communication, members, target, design.relay)
+            own = np.linalg.inv(m).sum(axis=1)[members.index(observer)] * float(funnel(row["time"]))
+            assert row["bound"] == pytest.approx(own, rel=1e-12)
+            assert row["bound"] <= row["delta"]
+            assert abs(row["error"]) < row["bound"]
 
 
 def test_the_guarantee_can_be_read_off_the_table(table):

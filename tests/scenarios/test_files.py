@@ -43,6 +43,7 @@ def everything() -> Scenario:
         communication=ring,
         task=nx.path_graph(7),
         k=3,
+        design_rule="sharp",
         relay=False,
         delta={
             "integrator": Exponential(40.0, 0.1, 4.0),
@@ -94,6 +95,7 @@ def test_a_round_trip_gives_the_same_bits(make, tmp_path):
         "description",
         "k",
         "relay",
+        "design_rule",
         "duration",
         "dt",
         "order",
@@ -214,6 +216,7 @@ REFUSALS = [  # (what is replaced, by what, the key named, what else the message
     ("k = 2", "k = 2.0", "k", ["got 2.0, expected an integer"]),
     ("k = 2", "k = 2\norder = 3", "order", ["got 3, expected 1 or 2"]),
     ("k = 2", "k = 2\nfigure_agent = 'a'", "figure_agent", ["expected an integer"]),
+    ("k = 2", 'k = 2\ndesign_rule = "blunt"', "design_rule", ["got 'blunt', expected \"paper\" or \"sharp\""]),
     ("k = 2", "k = 2\nduraton = 3", "duraton", ["did you mean 'duration'?"]),
     ("k = 2", "k = 2\ndt = -1", "scenario 'small'", ["dt must be positive and finite; got -1"]),
     ("k = 2", "k =", "not a TOML file", ["line 3"]),

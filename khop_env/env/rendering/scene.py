@@ -123,7 +123,8 @@ class Estimates:
         place = [fleet.position_index[j, :d] - fleet.state_offset[j] for j in self.targets]
         self._columns = np.array([slots[j] + p for j, p in zip(self.targets, place, strict=True)], int).reshape(-1, d)
         rows = np.array([first[j] + p for j, p in zip(self.targets, place, strict=True)], int).reshape(-1)
-        self._bound = FunnelBank([design.states.bounds[row] for row in rows])
+        self._delta = FunnelBank([design.states.bounds[row] for row in rows])
+        self._share = design.states.share[layout.column_pair[self._columns]]
         own = headings(fleet)
         self._heading = [slots[j] + own[j] - fleet.state_offset[j] if own[j] >= 0 else -1 for j in self.targets]
 
@@ -137,12 +138,12 @@ class Estimates:
 
     def half_widths(self, t: float) -> FloatArray:
         """(K, d) of the box around each estimate that is guaranteed to hold the target, in m, at `t` s."""
-        rows = len(self._bound)
-        return self._bound.evaluate(np.array([t]), np.empty((rows, 1))).reshape(self._columns.shape)
+        delta = self._delta.evaluate(np.array([t]), np.empty((len(self._delta), 1)))
+        return self._share * delta.reshape(self._columns.shape)
 
     def final_half_widths(self) -> FloatArray:
         """(K, d) of the box as t goes to infinity, in m."""
-        return self._bound.infimum().reshape(self._columns.shape)
+        return self._share * self._delta.infimum().reshape(self._columns.shape)
 
 
 def sensible(positions: FloatArray) -> FloatArray:
