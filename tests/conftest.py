@@ -24,8 +24,65 @@ PROFILE = {
 settings.register_profile("reproducible", max_examples=100, **PROFILE)
 settings.register_profile("quick", max_examples=10, **PROFILE)
 
-SLOW: tuple[str, ...] = ()
-"""Beginnings of the ids of tests that aren't part of the quick selection."""
+SLOW = tuple(
+    f"tests/{beginning}"
+    for beginning in (
+        # trainings
+        "agents/test_evaluation.py::test_a_model_of_stable_baselines_plays",
+        "agents/test_learned_policies.py",
+        "agents/test_learning.py",
+        "agents/test_resuming.py",
+        "env/test_integrations.py::TestSuperSuit::test_ppo",
+        "env/test_sb3.py::test_ppo",
+        # processes, one or more per test
+        "agents/test_workers.py",
+        "env/test_concurrency.py",
+        "agents/test_evaluation.py::test_the_same_numbers",
+        "benchmarks/test_benchmark.py::test_ctrl_c",
+        "env/test_integrations.py::TestNames::test_import",
+        "env/test_windows.py::test_without_a_display",
+        "results/test_figures.py::test_pyplot_is_left_alone",
+        "test_cli.py::TestRun",
+        "test_cli.py::test_as_a_module",
+        "test_cli.py::test_tables_fit_80_columns",
+        "test_cli_agents.py",
+        "test_cli_contract.py",
+        "test_cli_folders.py",
+        "test_cli_objects.py",
+        "test_cli_train.py",
+        "test_compiled.py::test_a_change_in_another_file_is_seen",
+        "test_compiled.py::test_no_byte_of_a_file",
+        "test_core_only.py",
+        "test_imports.py::test_the_core_needs_no_extra",
+        "test_own_agents.py",
+        "test_readme.py",
+        "test_quick.py::test_every_room",
+        "test_registry.py::test_heavy_imports_wait",
+        "test_surface.py::test_a_user_s_file_is_clean",
+        "test_surface.py::test_one_name_imports",
+        "test_surface.py::test_scenarios_is_the_package",
+        # many episodes, or many steps
+        "agents/test_policy_files.py::test_a_zip_bomb",
+        "agents/test_policy_files.py::test_every_mutation",
+        "agents/test_scripted.py::test_every_law_makes_progress_everywhere",
+        "agents/test_set_iss.py",
+        "agents/test_tuning.py",
+        "benchmarks/test_benchmark.py::test_every_promised_figure_is_printed",
+        "env/test_contract.py::test_the_public_checks_pass",
+        "env/test_contract.py::test_300_steps",
+        "observers/test_funnel_kept.py",
+        "observers/test_theorems.py",
+        "results/test_report.py::TestFloatingPoint",
+        "results/test_writing.py::test_states_that_are_not_finite",
+        "scenarios/test_fuzz.py",
+        "tasks/test_own_task.py::test_every_kind",
+        "tasks/test_own_task.py::test_it_keeps_the_contract",
+        "testing/test_checking.py::test_each_fault",
+        "testing/test_checking.py::test_each_view",
+        "testing/test_checking.py::test_the_other_views",
+    )
+)
+"""Beginnings of the ids of tests that aren't part of the quick selection, by what takes the time."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
