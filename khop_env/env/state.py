@@ -83,7 +83,7 @@ def signature(
         "control periods": (steps,),
         "disturbances": (repr(disturbance),),
         "bounds": tuple(bounds),
-        "design rules": (design.design_rule,),
+        "design rules": (design.states.rule,),
         "numbers of hops": (f"k = {design.k}",),
     }
 

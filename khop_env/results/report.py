@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from khop_env.observers import DesignError, Exponential, FloatArray, Funnels, ObserverDesign, PerformanceFunction
+from khop_env.observers.design import design_rule_for
+from khop_env.physics import one_way_links
 from khop_env.results.assumptions import assumptions
 from khop_env.scenarios import Scenario
 from khop_env.simulation.simulator import parts_of_step
@@ -19,12 +21,14 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
     Returns:
         feasible: whether every condition of the observers holds that can be checked before the start; `error` says
             which doesn't.
+        edges: of the communication graph, or its links if it is directed; one_way_links: how many have no link back.
         design_rule: from the bounds delta and theta to the funnels rho and omega.
-        targets: per agent that is estimated: its k-hop set, eta, lambda_min and lambda_max of M_i, own_bound, the
-            smallest and the largest of its observers' own guaranteed bounds over delta (theta), and under `state` and
-            `input` per group of components with equal numbers: delta and rho (theta and omega), each with its
-            value at 0 and at infinity and its rate, and start_share, the largest |xi(0)| / rho(0) over the initial
-            set; null where |g| is unbounded, so that only `Simulator.reset` can tell.
+        targets: per agent that is estimated: its k-hop set (the agents that estimate it), eta, lambda_min and
+            lambda_max of M_i (moduli of eigenvalues where links go one way), own_bound, the smallest and the largest of
+            its observers' own guaranteed bounds over delta (theta), and under `state` and `input` per group of
+            components with equal numbers: delta and rho (theta and omega), each with its value at 0 and at infinity and
+            its rate, and start_share, the largest |xi(0)| / rho(0) over the initial set; null where |g| is unbounded,
+            so that only `Simulator.reset` can tell.
         pairs: of observer and target; estimates: numbers that they estimate.
         explicit_step_bound_s: no explicit Euler step longer than this is stable at steady state (it has to be far
             shorter): the smallest over all targets, for both kinds of observers.
@@ -38,9 +42,10 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         "description": scenario.description,
         "agents": len(scenario.models),
         "edges": scenario.communication.number_of_edges(),
+        "one_way_links": len(one_way_links(scenario.communication)),
         "k": scenario.k,
         "relay": scenario.relay,
-        "design_rule": scenario.design_rule,
+        "design_rule": design_rule_for(scenario.communication, scenario.design_rule),
         "feasible": False,
         "error": None,
         "pairs": None,
