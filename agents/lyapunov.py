@@ -143,7 +143,7 @@ def consensus_gain(scenario: Scenario, gain: float, *, bounded: bool) -> Compari
         return None
     adjacency = nx.to_numpy_array(task)  # networkx's own Laplacian needs SciPy
     connectivity = float(np.linalg.eigvalsh(np.diag(adjacency.sum(axis=0)) - adjacency)[1])
-    estimated = max(sum(not scenario.communication.has_edge(i, j) for j in task[i]) for i in range(len(fleet)))
+    estimated = max(sum(not scenario.communication.has_edge(j, i) for j in task[i]) for i in range(len(fleet)))
     return ComparisonGain(
         coupling=gain * connectivity,
         lipschitz=models[0].drift_lipschitz(),

@@ -116,7 +116,7 @@ def injected_errors(
     """
     calm, bound, batch = scenario.replace(disturbance=None), analytical_gain(scenario), episodes * len(PATTERNS)
     edges = directed(calm.task)
-    perturbed = np.array([not calm.communication.has_edge(i, j) for i, j in edges.tolist()], bool)
+    perturbed = np.array([not calm.communication.has_edge(j, i) for i, j in edges.tolist()], bool)
     x0 = [calm.initial.draw(np.random.default_rng(seed + b // len(PATTERNS))) for b in range(batch)]
     steps = round(calm.duration / calm.dt)
     rows: list[dict[str, Any]] = []
@@ -334,7 +334,7 @@ def _read_columns(scenario: Scenario) -> tuple[NDArray[np.int64], NDArray[np.int
     fleet, slot = scenario.fleet, scenario.design.states.layout.slot
     read, truth = [], []
     for i, j in directed(scenario.task).tolist():
-        if not scenario.communication.has_edge(i, j):
+        if not scenario.communication.has_edge(j, i):
             read.append(slot[i, j] + fleet.position_index[j] - fleet.state_offset[j])
             truth.append(fleet.position_index[j])
     return np.array(read, np.int64).reshape(-1), np.array(truth, np.int64).reshape(-1)

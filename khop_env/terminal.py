@@ -202,18 +202,21 @@ def _ratio(value: float | None) -> str:
 
 def print_design(report: Mapping[str, Any]) -> None:
     """The design report as tables."""
+    one_way = report["one_way_links"]
+    edges = f"{report['edges']} links, {one_way} of them one way" if one_way else f"{report['edges']} edges"
     print_text(
-        f"{report['scenario']}: {report['agents']} agents, {report['edges']} edges, k = {report['k']}, "
+        f"{report['scenario']}: {report['agents']} agents, {edges}, k = {report['k']}, "
         f"{'with' if report['relay'] else 'without'} relay, design rule {report['design_rule']}"
+        f"{' (the paper rule needs links both ways)' if one_way and report['design_rule'] != 'paper' else ''}"
     )
     targets = report["targets"]
     if targets:
-        shown = targets[:SHOWN_TARGETS]
+        shown, spectrum = targets[:SHOWN_TARGETS], "|lambda(M)|" if one_way else "lambda(M)"
         print_table(
-            ("target", "k-hop set", "eta", "lambda(M)", "bound / delta"),
+            ("target", "k-hop set", "eta", spectrum, "bound / delta"),
             [_spectrum_row(target) for target in shown],
             "Observers, by the agent that they estimate, and their own bounds over delta",
-            whole=("target", "lambda(M)", "bound / delta"),
+            whole=("target", spectrum, "bound / delta"),
         )
         typer.echo()
         print_table(

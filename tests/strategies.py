@@ -43,23 +43,36 @@ OBSERVABLE_INPUT = tuple(model for model in PLANAR if not model.input_map_uses_s
 # -- the paper's definitions, from the graph alone -----------------------------------------------------------------
 
 
+def heard(graph: nx.Graph, agent: int) -> set[int]:
+    """The agents whose messages an agent receives: its neighbours, or those with a link to it."""
+    return set(graph.predecessors(agent) if graph.is_directed() else graph[agent])
+
+
 def k_hop_sets(graph: nx.Graph, k: int, relay: bool) -> list[set[int]]:
-    """N_i^{k-hop}: the agents at distance 2..k; from 1 on where Assumption 4 doesn't hold (remark after Lemma 1)."""
+    """N_i^{k-hop}: the agents at distance 2..k; from 1 on where Assumption 4 doesn't hold (remark after Lemma 1).
+
+    Of a directed graph those that i reaches at that distance.
+    """
     distance = dict(nx.all_pairs_shortest_path_length(graph))
     nearest = 2 if relay else 1
-    return [{j for j in graph if nearest <= distance[i][j] <= k} for i in sorted(graph)]
+    return [{j for j, hop in distance[i].items() if nearest <= hop <= k} for i in sorted(graph)]
 
 
 def relays(graph: nx.Graph, observer: int, target: int, relay: bool) -> int:
-    """The diagonal of H_i: |N_a cap N_i|, or without relay whether a is a neighbour of i."""
+    """The diagonal of H_i: |N_a cap N_i|, or without relay whether a is a neighbour of i.
+
+    Of a directed graph the number of agents that a hears and that hear i, or whether a hears i.
+    """
     if relay:
-        return len(set(graph[observer]) & set(graph[target]))
-    return int(graph.has_edge(observer, target))
+        return sum(target in heard(graph, middle) for middle in heard(graph, observer))
+    return int(target in heard(graph, observer))
 
 
 def definition_of_m(graph: nx.Graph, members: list[int], target: int, relay: bool) -> np.ndarray:
     """M_i = L_i + H_i over `members`, the k-hop neighbours of the target in the order wanted."""
-    laplacian = nx.laplacian_matrix(graph.subgraph(members), nodelist=members).toarray().astype(float)
+    adjacency = np.array([[float(other in heard(graph, member)) for other in members] for member in members])
+    adjacency = adjacency.reshape(len(members), len(members))
+    laplacian = np.diag(adjacency.sum(axis=1)) - adjacency
     return laplacian + np.diag([float(relays(graph, member, target, relay)) for member in members])
 
 
@@ -81,6 +94,18 @@ def connected_graphs(draw: st.DrawFn, smallest: int = 3, largest: int = 9) -> nx
     ends = st.tuples(st.integers(0, agents - 1), st.integers(0, agents - 1))
     graph.add_edges_from((i, j) for i, j in draw(st.lists(ends, max_size=agents)) if i != j)
     return graph
+
+
+@st.composite
+def digraphs(draw: st.DrawFn, smallest: int = 3, largest: int = 9) -> nx.DiGraph:
+    """A connected graph of which each edge is a link one way or the other, or both."""
+    graph = draw(connected_graphs(smallest, largest))
+    links = nx.DiGraph()
+    links.add_nodes_from(graph)
+    for i, j in graph.edges:
+        ways = draw(st.sampled_from([((i, j),), ((j, i),), ((i, j), (j, i))]))
+        links.add_edges_from(ways)
+    return links
 
 
 @st.composite
@@ -160,6 +185,7 @@ def systems(
     margin: float = 1.05,
     largest: int = 9,
     rule: DesignRule | None = None,
+    directed: bool = False,
 ) -> System:
     """A whole random system.
 
@@ -172,10 +198,12 @@ def systems(
         floor: the smallest bound on an estimation error at steady state.
         margin: how much larger than the smallest feasible one the bounds start, at least.
         largest: number of agents at most.
-        rule: the design rule; drawn if left out.
+        rule: the design rule; drawn if left out, or sharp where links go one way.
+        directed: whether they may.
     """
-    rule = draw(st.sampled_from(get_args(DesignRule))) if rule is None else rule
-    graph = draw(connected_graphs(largest=largest))
+    graph = draw((digraphs if directed else connected_graphs)(largest=largest))
+    if rule is None:
+        rule = "sharp" if directed else draw(st.sampled_from(get_args(DesignRule)))
     k, relay = draw(hops(relay))
     agents = len(graph)
     fleet = Fleet([draw(st.sampled_from(models)) for _ in range(agents)])
@@ -204,7 +232,7 @@ def systems(
         )
     )
     within = dict(nx.all_pairs_shortest_path_length(graph, k))
-    pairs = [(i, j) for i in range(agents) for j in range(i) if j in within[i]]
+    pairs = [(i, j) for i in range(agents) for j in range(i) if j in within[i] and i in within[j]]
     task = nx.empty_graph(agents)
     task.add_edges_from(pairs[p] for p in rng.permutation(len(pairs))[: agents + 1])
     return System(design, initial, disturbance, task, deltas, thetas, seed)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from khop_env.observers import IntArray, ObserverDesign
-from khop_env.physics import AgentModel, did_you_mean, hop_distances
+from khop_env.physics import AgentModel, did_you_mean, hops_from_targets
 
 Float32Array = NDArray[np.float32]
 
@@ -44,7 +44,7 @@ class Slot:
         agent: its index in the fleet.
         id: its id.
         heard: whether it is a neighbour (1 hop), whose state is received; otherwise its state is estimated.
-        hops: distance in the communication graph.
+        hops: distance in the communication graph, from it to the observing agent.
         task_edge: whether the observing agent's task has an edge to it.
     """
 
@@ -185,7 +185,7 @@ def slots_of(design: ObserverDesign, edges: IntArray, agents: Sequence[int]) -> 
     Raises:
         ValueError: for a task edge to an agent more than k hops away.
     """
-    hops = hop_distances(design.communication, design.k)
+    hops = hops_from_targets(design.communication, design.k)
     related: list[set[int]] = [set() for _ in range(len(design.fleet))]
     for i, j in edges.tolist():
         related[i].add(j)

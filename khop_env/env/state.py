@@ -86,7 +86,7 @@ def signature(
         "control periods": (steps,),
         "disturbances": ("none" if disturbance is None else described(disturbance),),
         "bounds": tuple(bounds),
-        "design rules": (design.design_rule,),
+        "design rules": (design.states.rule,),
         "numbers of hops": (f"k = {design.k}",),
     }
 

@@ -26,7 +26,7 @@ import numpy as np
 from khop_env.brief import brief
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.observers.performance import FunnelBank, PerformanceFunction, scaled
-from khop_env.physics import Fleet, Links, k_hop_neighbors, validate_graph
+from khop_env.physics import Fleet, Links, k_hop_neighbors, one_way_links, validate_graph
 
 Bound = PerformanceFunction | Sequence[PerformanceFunction]
 """A bound on a target's estimation error: one function for all its components, or one for each.
@@ -42,14 +42,17 @@ class DesignError(ValueError):
     """The observers can't be designed with these arguments; the message names a value that is feasible."""
 
 
-def require_design_rule(rule: object) -> None:
-    """Refuse an unknown design rule.
+def design_rule_for(graph: nx.Graph, rule: DesignRule | None) -> DesignRule:
+    """The design rule on a communication graph: `rule`, or the default, "sharp" where links go one way.
 
     Raises:
-        ValueError: naming it and the known ones.
+        ValueError: for an unknown rule; the message names the known ones.
     """
+    if rule is None:
+        return "sharp" if one_way_links(graph) else "paper"
     if not isinstance(rule, str) or rule not in get_args(DesignRule):
         raise ValueError(f"design_rule must be one of {', '.join(get_args(DesignRule))}; got {rule!r}")
+    return rule
 
 
 @dataclass(frozen=True)
@@ -146,13 +149,14 @@ class Funnels:
     def explicit_step_bound(self) -> FloatArray:
         """(targets,) longest stable step of explicit Euler at steady state and e = 0, in s.
 
-        It is 2 / (lambda_max(M_i) phi''(0) / rho(inf)^2) with phi''(0) = 4. Away from e = 0 the stable step is up to a
+        It is 2 / (lambda_max(M_i) phi''(0) / rho(inf)^2) with phi''(0) = 4, and `PairLayout.euler_rate` in place of
+        lambda_max on a directed graph. Away from e = 0 the stable step is up to a
         hundred times shorter, so choose steps far below it.
         """
         floor = self.rho.infimum()
         per_target = np.full(len(self.layout.target), np.inf)
         np.minimum.at(per_target, self.layout.row_target, floor)
-        return 0.5 * per_target**2 / self.layout.eigenvalues[:, 1]
+        return 0.5 * per_target**2 / self.layout.euler_rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,20 +165,29 @@ class ObserverDesign:
 
     Args:
         fleet: the agents.
-        communication: their communication graph, nodes 0..N-1, connected.
-        k: estimate agents up to k hops away.
+        communication: their communication graph, nodes 0..N-1, connected; a networkx.DiGraph for links that go one
+            way, with an edge b -> a where agent a hears agent b.
+        k: estimate agents up to k hops away, along the links.
         delta: bound on the state estimation errors: one performance function for all, or one `Bound` per target.
         theta: likewise for the input estimation errors; may be None where no target has an input observer.
         relay: whether agents relay their neighbours' states (Assumption 4); without it 1-hop neighbours are estimated
             too, from the target's own messages (the paper's remarks).
         targets: per agent the options of its observers; `TargetObservers()` by default, without the input observer
             where the input map depends on the state.
-        design_rule: from delta to the funnels, "paper" or "sharp".
+        design_rule: from delta to the funnels, "paper" or "sharp"; by default the paper's, or the sharp one where links
+            go one way and the paper's, which needs symmetric matrices, doesn't apply.
+
+    Attributes:
+        links: the directed links of the graph.
+        neighborhoods: per agent the agents that estimate it; on an undirected graph also those that it estimates.
+        options: per agent the options of its observers.
+        states: the state observers' pairs and funnels.
+        inputs: the input observers'.
 
     Raises:
-        DesignError: an input observer for an agent whose g depends on its state, none for an agent whose g is
-            unbounded, or a bound that is missing or of a wrong length.
-        ValueError: a graph that isn't undirected, connected and labelled 0..N-1, or an unknown design rule.
+        DesignError: the paper's design rule where links go one way, an input observer for an agent whose g depends on
+            its state, none for an agent whose g is unbounded, or a bound that is missing or of a wrong length.
+        ValueError: a graph that isn't connected and labelled 0..N-1, or an unknown design rule.
     """
 
     fleet: Fleet
@@ -184,7 +197,7 @@ class ObserverDesign:
     theta: PerformanceFunction | Mapping[int, Bound] | None = None
     relay: bool = True
     targets: Sequence[TargetObservers] | None = None
-    design_rule: DesignRule = "paper"
+    design_rule: DesignRule | None = None
     links: Links = field(init=False)
     neighborhoods: tuple[tuple[int, ...], ...] = field(init=False)
     options: tuple[TargetObservers, ...] = field(init=False)
@@ -193,8 +206,15 @@ class ObserverDesign:
 
     def __post_init__(self) -> None:
         fleet = self.fleet
-        validate_graph(self.communication, len(fleet))
-        require_design_rule(self.design_rule)
+        validate_graph(self.communication, len(fleet), directed=True)
+        rule = design_rule_for(self.communication, self.design_rule)
+        one_way = one_way_links(self.communication)
+        if rule == "paper" and one_way:
+            sender, receiver = (fleet.ids[i] for i in one_way[0])
+            raise DesignError(
+                f'design_rule = "paper" needs symmetric matrices M_i, and {len(one_way)} links go one way, the first '
+                f'from {sender!r} to {receiver!r}; take design_rule = "sharp", or links both ways'
+            )
         options = self.targets or [TargetObservers(input_observer=not m.input_map_uses_state) for m in fleet.models]
         if len(options) != len(fleet):
             raise DesignError(f"targets has {len(options)} entries, the fleet {len(fleet)} agents; give one per agent")
@@ -222,11 +242,12 @@ class ObserverDesign:
         )
         states, inputs = lay_out(), lay_out(targets=observed_inputs)
         values = {
+            "design_rule": rule,
             "links": links,
             "neighborhoods": neighborhoods,
             "options": tuple(options),
-            "states": Funnels(states, self._rows(states, self.delta, "delta"), self.design_rule),
-            "inputs": Funnels(inputs, self._rows(inputs, self.theta, "theta"), self.design_rule),
+            "states": Funnels(states, self._rows(states, self.delta, "delta"), rule),
+            "inputs": Funnels(inputs, self._rows(inputs, self.theta, "theta"), rule),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -244,12 +265,12 @@ class ObserverDesign:
         theta: PerformanceFunction | Mapping[int, Bound] | None = None,
     ) -> ObserverDesign:
         """The same observers with other bounds: graphs, layouts and spectra are shared, not computed again."""
-        other = copy.copy(self)
+        other, states, inputs = copy.copy(self), self.states, self.inputs
         for name, value in (
             ("delta", delta),
             ("theta", theta),
-            ("states", Funnels(self.states.layout, self._rows(self.states.layout, delta, "delta"), self.design_rule)),
-            ("inputs", Funnels(self.inputs.layout, self._rows(self.inputs.layout, theta, "theta"), self.design_rule)),
+            ("states", Funnels(states.layout, self._rows(states.layout, delta, "delta"), states.rule)),
+            ("inputs", Funnels(inputs.layout, self._rows(inputs.layout, theta, "theta"), inputs.rule)),
         ):
             object.__setattr__(other, name, value)
         return other

@@ -146,7 +146,7 @@ class Explicit(FunnelObservers):
         curvature = np.zeros((len(layout.target), self.num_envs))
         widths = funnels.rho.evaluate(start, np.empty((layout.rows, self.num_envs)))
         largest_curvature(layout.arrays, e, widths, curvature)
-        stable = 2.0 / (layout.eigenvalues[target, 1] * curvature[target, env])
+        stable = 2.0 / (layout.euler_rate[target] * curvature[target, env])
         return (
             f"the explicit step left the funnel: {kind} observer of {self._name(funnels, column, env)} reached "
             f"|{'e' if kind == 'state' else 'q'}| = {ratio[column, env]:.4g} at t = {start[env] + dt:.6g} s with "

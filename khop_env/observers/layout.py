@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,8 @@ class PairArrays(NamedTuple):
         entry: (entries,) places within the target of the observers whose estimates the observer receives: the
             off-diagonal -1 entries of M_i.
         first: (pairs,) place of the first non-zero of each row of M_i (its lower profile).
+        column_sum: (pairs,) sum of each column of M_i; as `relay`, the sum of each row, where M_i is symmetric.
+        last: (pairs,) place of the last non-zero of each row of M_i's factor U; empty if all links go both ways.
     """
 
     observers: IntArray
@@ -54,6 +56,8 @@ class PairArrays(NamedTuple):
     entry_start: IntArray
     entry: IntArray
     first: IntArray
+    column_sum: FloatArray
+    last: IntArray
 
 
 class TargetBlock(NamedTuple):
@@ -122,8 +126,8 @@ class PairLayout:
         """Lay out the observers of `targets`.
 
         Args:
-            links: the directed links of the communication graph.
-            neighborhoods: per agent its k-hop neighbours (`physics.k_hop_neighbors`).
+            links: of the communication graph.
+            neighborhoods: per agent the agents that estimate it (`physics.k_hop_neighbors`).
             dimensions: per agent the number of components estimated, n_i.
             offsets: per agent where its components start in the fleet's flat vector.
             relay: whether neighbours relay the target's state (the paper's Assumption 4).
@@ -136,6 +140,8 @@ class PairLayout:
         relay_count: list[int] = []
         diagonal: list[int] = []
         first: list[int] = []
+        last: list[int] = []
+        column_sum: list[int] = []
         entry: list[int] = []
         entry_start = [0]
         entry_link: list[int] = []
@@ -162,6 +168,12 @@ class PairLayout:
                 entry_link.extend(links.index[members[b], agent] for b in linked)
                 relay_link.extend(links.index[p, agent] for p in relays)
                 relay_start.append(len(relay_link))
+                if not links.symmetric:
+                    begin = len(last) - a
+                    last.append(max([a, *linked, *last[begin + first[-1] : begin + a]]))
+            pairs = range(len(observer) - len(members), len(observer))
+            told = np.bincount(entry[entry_start[pairs.start] :], minlength=len(members)).tolist()
+            column_sum.extend(diagonal[pair] - count for pair, count in zip(pairs, told, strict=True))
             size += len(members) * dimensions[i]
             rows += dimensions[i]
         of_target = np.ascontiguousarray(np.array(blocks, dtype=np.int64).reshape(-1, 6).T)
@@ -178,6 +190,8 @@ class PairLayout:
                 entry_start=np.array(entry_start, dtype=np.int64),
                 entry=np.array(entry, dtype=np.int64),
                 first=np.array(first, dtype=np.int64),
+                column_sum=np.array(column_sum, dtype=np.float64),
+                last=np.array(last, dtype=np.int64),
             ),
             target=np.array(target, dtype=np.int64),
             observer=np.array(observer, dtype=np.int64),
@@ -251,7 +265,7 @@ class PairLayout:
         return np.repeat(np.arange(len(self.target)), self.arrays.components)
 
     def matrix(self, index: int) -> FloatArray:
-        """M_i = L_i + H_i of `target[index]` as a dense (eta_i, eta_i) array, ordered as `observer` (Lemma 1: > 0)."""
+        """M_i = L_i + H_i of `target[index]`, dense (eta_i, eta_i), ordered as `observer`: nonsingular (Lemma 1)."""
         block, arrays = self.blocks[index], self.arrays
         matrix = np.diag(arrays.diagonal[block.pairs])
         for a, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
@@ -260,12 +274,31 @@ class PairLayout:
 
     @cached_property
     def eigenvalues(self) -> FloatArray:
-        """(targets, 2): smallest and largest eigenvalue of each M_i."""
+        """(targets, 2): smallest and largest eigenvalue of each M_i; their moduli where links go one way."""
         extremes = np.zeros((len(self.target), 2))
-        for groups, matrices in self._distinct_matrices():
-            for members, values in zip(groups, np.linalg.eigvalsh(matrices), strict=True):
+        for groups, spectra in self._spectra():
+            for members, values in zip(groups, np.sort(np.abs(spectra)), strict=True):
                 extremes[members] = values[[0, -1]]
         return extremes
+
+    @cached_property
+    def euler_rate(self) -> FloatArray:
+        """(targets,) r of each M_i: explicit Euler damps y' = -c M_i y, c > 0, if its step is below 2 / (c r).
+
+        The largest |l|^2 / Re l of its eigenvalues l, whose real parts are positive: lambda_max if M_i is symmetric.
+        """
+        if self.links.symmetric:
+            return self.eigenvalues[:, 1]
+        rates = np.zeros(len(self.target))
+        for groups, spectra in self._spectra():
+            for members, rate in zip(groups, (np.abs(spectra) ** 2 / spectra.real).max(axis=1), strict=True):
+                rates[members] = rate
+        return rates
+
+    def _spectra(self) -> Iterator[tuple[list[list[int]], NDArray[Any]]]:
+        """Eigenvalues of the matrices M_i, each with the targets that share it."""
+        of = np.linalg.eigvalsh if self.links.symmetric else np.linalg.eigvals
+        return ((groups, of(matrices)) for groups, matrices in self._distinct_matrices())
 
     @cached_property
     def inverse_row_sums(self) -> FloatArray:
@@ -273,15 +306,13 @@ class PairLayout:
         sums = np.zeros(self.pairs)
         for groups, matrices in self._distinct_matrices():
             found = np.linalg.solve(matrices, np.ones((*matrices.shape[:2], 1)))[..., 0]
-            for members, values in zip(groups, found, strict=True):
-                for index in members:
-                    sums[self.blocks[index].pairs] = values
+            for index, values in ((i, row) for some, row in zip(groups, found, strict=True) for i in some):
+                sums[self.blocks[index].pairs] = values
         return sums
 
     def _distinct_matrices(self) -> Iterator[tuple[list[list[int]], FloatArray]]:
         """Stacks of the matrices M_i, each with the targets that share it: those of a star, say, are all equal."""
-        alike: dict[tuple[bytes, ...], list[int]] = {}
-        arrays = self.arrays
+        alike, arrays = dict[tuple[bytes, ...], list[int]](), self.arrays
         for index, block in enumerate(self.blocks):
             start = arrays.entry_start[block.pairs.start : block.pairs.stop + 1]
             content = arrays.diagonal[block.pairs], start - start[0], arrays.entry[start[0] : start[-1]]

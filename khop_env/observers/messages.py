@@ -128,23 +128,20 @@ class MessagePassing:
     """
 
     def __init__(self, design: ObserverDesign, num_envs: int) -> None:
-        self._design, graph = design, design.communication
+        self._design, senders = design, design.links.senders
         rho = _per_target(design.states)
         omega = _per_target(design.inputs)
         self.agents: list[ObserverAgent] = []
         for a in range(len(design.fleet)):
-            neighbors = set(graph[a])
             targets = {}
-            for i in design.neighborhoods[
-                a
-            ]:  # graph distance is symmetric: a estimates exactly the agents that estimate a
-                relays = neighbors & set(graph[i]) if design.relay else neighbors & {i}
+            for i in sorted(i for observer, i in design.states.layout.slot if observer == a):
+                relays = [p for p in senders[a] if (i in senders[p] if design.relay else p == i)]
                 targets[i] = HeldEstimate(
                     design.fleet.models[i],
                     design.options[i].drift,
                     rho[i],
                     omega.get(i),
-                    peers=tuple(sorted(neighbors & set(design.neighborhoods[i]))),
+                    peers=tuple(sorted(senders[a] & set(design.neighborhoods[i]))),
                     relays=tuple(sorted(relays)),
                 )
             self.agents.append(ObserverAgent(a, targets))
@@ -169,13 +166,13 @@ class MessagePassing:
                     target.input_estimate = memory["input_estimate"][at : at + n, env]
 
         own = [(state.x[fleet.state_slice(i), env], state.g[fleet.state_slice(i), env]) for i in range(len(fleet))]
-        graph = design.communication
+        senders = design.links.senders
         sent = [
-            agent.message(*own[agent.index], {j: own[j] for j in graph[agent.index]} if design.relay else {})
+            agent.message(*own[agent.index], {j: own[j] for j in senders[agent.index]} if design.relay else {})
             for agent in self.agents
         ]
         for agent in self.agents:
-            inbox = {j: sent[j] for j in graph[agent.index]}
+            inbox = {j: sent[j] for j in senders[agent.index]}
             for i, target in agent.targets.items():
                 rate, input_rate, normalized, input_normalized = agent.derivative(float(state.t[env]), i, inbox)
                 at, n = slot[agent.index, i], target.model.n

@@ -13,7 +13,9 @@ Written in the impulse z = phi'(e) and with b = P^-1 (M y* - h x_i), s = tau / r
     e(z) + s M z = b,
 
 where e(z) is increasing and bounded with slope in (0, 1/4]. Newton's matrix diag(de/dz) + s M is symmetric positive
-definite with M's sparsity, and never singular. The unknown that is carried is eps = T(e): any real number, so no step
+definite with M's sparsity, and never singular. Where links go one way M isn't symmetric, but a row-wise diagonally
+dominant M-matrix: there is still exactly one solution (docs/theory_graphs.md), and Newton's matrix is factorised by LU,
+which needs no pivoting. The unknown that is carried is eps = T(e): any real number, so no step
 can leave the funnel, and no digits are lost at its wall.
 
 A last step is linear in z, and e(z) + s M z = b then holds to rounding however small the step was: the disagreement
@@ -28,7 +30,8 @@ import numpy as np
 
 from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import expm1, log
-from khop_env.observers.layout import FloatArray, IntArray, PairArrays
+from khop_env.observers.layout import FloatArray, PairArrays
+from khop_env.observers.newton import newton_step, newton_step_one_way
 
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
 MAX_ITERATIONS = 200
@@ -82,69 +85,6 @@ def _barriers(
 
 
 @compiled
-def _newton_step(
-    eta: int,
-    pair: int,
-    lanes: int,
-    diagonal: FloatArray,
-    entry_start: IntArray,
-    entry_of: IntArray,
-    first: IntArray,
-    scale: FloatArray,
-    b: FloatArray,
-    e: FloatArray,
-    z: FloatArray,
-    gain: FloatArray,
-    dz: FloatArray,
-    pivot: FloatArray,
-    entry: FloatArray,
-    lower: FloatArray,
-    row_start: IntArray,
-) -> None:
-    """Solve (diag(de/dz) + s M) dz = b - e - s M z for all lanes, by L D L' in the profile of M (no square roots)."""
-    for a in range(eta):
-        d, begin = diagonal[pair + a], first[pair + a]
-        for lane in range(lanes):
-            dz[a, lane] = d * z[a, lane]
-        for j in range(begin, a):
-            for lane in range(lanes):
-                entry[j, lane] = 0.0
-        for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
-            other = entry_of[k]
-            for lane in range(lanes):
-                dz[a, lane] -= z[other, lane]
-            if other < a:
-                for lane in range(lanes):
-                    entry[other, lane] = -scale[lane]
-        for lane in range(lanes):
-            normalized = e[a, lane]
-            dz[a, lane] = b[a, lane] - normalized - scale[lane] * dz[a, lane]
-            pivot[a, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * d
-        for j in range(begin, a):
-            for k in range(max(begin, first[pair + j]), j):
-                factor = row_start[j] + k
-                for lane in range(lanes):
-                    entry[j, lane] -= entry[k, lane] * lower[factor, lane]
-        for j in range(begin, a):
-            factor = row_start[a] + j
-            for lane in range(lanes):
-                multiplier = entry[j, lane] * pivot[j, lane]
-                lower[factor, lane] = multiplier
-                pivot[a, lane] -= entry[j, lane] * multiplier
-                dz[a, lane] -= multiplier * dz[j, lane]
-        for lane in range(lanes):
-            pivot[a, lane] = 1.0 / pivot[a, lane]
-    for a in range(eta):
-        for lane in range(lanes):
-            dz[a, lane] *= pivot[a, lane]
-    for a in range(eta - 1, 0, -1):
-        for j in range(first[pair + a], a):
-            factor = row_start[a] + j
-            for lane in range(lanes):
-                dz[j, lane] -= lower[factor, lane] * dz[a, lane]
-
-
-@compiled
 def _land(
     eta: int,
     lanes: int,
@@ -170,6 +110,7 @@ def _start_anew(
     pair: int,
     lanes: int,
     relay: FloatArray,
+    column_sum: FloatArray,
     scale: FloatArray,
     b: FloatArray,
     e: FloatArray,
@@ -182,8 +123,8 @@ def _start_anew(
 ) -> bool:
     """Replace a warm start that a jump of the source has made useless; return True if one was replaced.
 
-    Since M 1 = h, the equations of all observers add up to sum e + s sum h z = sum b. Where Newton's step for a common
-    impulse would be long, every observer starts from the one common impulse that meets the sum.
+    The equations of all observers add up to sum e + s 1'M z = sum b, with 1'M 1 = sum h. Where Newton's step for a
+    common impulse would be long, every observer starts from the one common impulse that meets the sum.
     """
     links = 0.0
     for lane in range(lanes):
@@ -191,11 +132,11 @@ def _start_anew(
         stiffness[lane] = 0.0
         total[0, lane] = 0.0
     for a in range(eta):
-        h = relay[pair + a]
+        h, column = relay[pair + a], column_sum[pair + a]
         links += h
         for lane in range(lanes):
             total[0, lane] += b[a, lane]
-            lack[lane] += b[a, lane] - e[a, lane] - scale[lane] * h * z[a, lane]
+            lack[lane] += b[a, lane] - e[a, lane] - scale[lane] * column * z[a, lane]
             # (de/dz + s h) / (deps/dz): change of the sum per unit of eps
             stiffness[lane] += 0.5 * (1.0 - e[a, lane] * e[a, lane]) + scale[lane] * h / gain[a, lane]
     far = 0.0
@@ -249,13 +190,14 @@ def solve(
         iterations, 5 on average; two along a run).
     """
     pairs = PairArrays(*pairs)
+    one_way = pairs.last.size > 0
     widest = profile = most = 1
     for t in range(targets[0], targets[1]):
         eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
         entries = 0
         for a in range(eta):
             entries += a - pairs.first[pair + a]
-        widest, profile = max(widest, eta), max(profile, entries)
+        widest, profile = max(widest, eta), max(profile, eta * eta if one_way else entries)
         most = max(most, n * min(max(1, LANES // n), batch[1] - batch[0]))
     diagonal, relay, first = pairs.diagonal, pairs.relay, pairs.first
     entry_start, entry_of = pairs.entry_start, pairs.entry
@@ -312,28 +254,49 @@ def solve(
             while moving:
                 _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 if iteration == 0 and _start_anew(
-                    eta, pair, lanes, relay, scale, b, e, z, gain, u, pivot, worst, poison
+                    eta, pair, lanes, relay, pairs.column_sum, scale, b, e, z, gain, u, pivot, worst, poison
                 ):
                     _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
-                _newton_step(
-                    eta,
-                    pair,
-                    lanes,
-                    diagonal,
-                    entry_start,
-                    entry_of,
-                    first,
-                    scale,
-                    b,
-                    e,
-                    z,
-                    gain,
-                    dz,
-                    pivot,
-                    entry,
-                    lower,
-                    row_start,
-                )
+                if one_way:
+                    newton_step_one_way(
+                        eta,
+                        pair,
+                        lanes,
+                        diagonal,
+                        entry_start,
+                        entry_of,
+                        first,
+                        pairs.last,
+                        scale,
+                        b,
+                        e,
+                        z,
+                        gain,
+                        dz,
+                        pivot,
+                        entry,
+                        lower,
+                    )
+                else:
+                    newton_step(
+                        eta,
+                        pair,
+                        lanes,
+                        diagonal,
+                        entry_start,
+                        entry_of,
+                        first,
+                        scale,
+                        b,
+                        e,
+                        z,
+                        gain,
+                        dz,
+                        pivot,
+                        entry,
+                        lower,
+                        row_start,
+                    )
                 evaluations += eta * lanes
                 iteration += 1
                 for lane in range(lanes):

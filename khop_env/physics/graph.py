@@ -1,6 +1,7 @@
 """Communication and task graphs, hop distances and k-hop neighbours.
 
-The paper's graph G = (V, E): agents are the nodes 0..N-1, an edge joins two neighbours, which exchange messages.
+The paper's graph G = (V, E): agents are the nodes 0..N-1, an edge joins two neighbours, which exchange messages. In a
+directed graph an edge b -> a is a link: agent a hears agent b.
 """
 
 from __future__ import annotations
@@ -15,25 +16,35 @@ from khop_env.physics.agent_model import FloatArray
 _LISTED = 8  # entries of a long list that an error message lists
 
 
-def validate_graph(graph: nx.Graph, agents: int, name: str = "communication graph", connected: bool = True) -> nx.Graph:
-    """Check that a graph satisfies the paper's Assumption 3, with the agents as nodes.
+def validate_graph(
+    graph: nx.Graph,
+    agents: int,
+    name: str = "communication graph",
+    connected: bool = True,
+    directed: bool = False,
+) -> nx.Graph:
+    """Check that a graph satisfies the paper's Assumption 3, or our extension of it, with the agents as nodes.
 
     Args:
-        graph: An undirected simple graph with the nodes 0..agents-1.
+        graph: A simple graph with the nodes 0..agents-1.
         agents: Number of agents N.
         name: Name of the graph in error messages.
-        connected: Whether the graph must be connected; the theorems require it of the communication graph.
+        connected: Whether the graph must be connected, a directed one weakly; the theorems require it of the
+            communication graph.
+        directed: Whether it may be a networkx.DiGraph.
 
     Returns:
         A frozen copy with its nodes in increasing order, so that matrices made from it are in the agents' order.
 
     Raises:
-        ValueError: The graph is directed or a multigraph, has other nodes, has a self-loop or isn't connected.
+        ValueError: The graph is directed where it may not be, or a multigraph, has other nodes, has a self-loop or
+            isn't connected.
     """
     if not isinstance(graph, nx.Graph):
         raise ValueError(f"{name}: expected a networkx.Graph, got {graph!r}")
-    if graph.is_directed() or graph.is_multigraph():
-        raise ValueError(f"{name}: expected an undirected simple networkx.Graph, got a {type(graph).__name__}")
+    if graph.is_multigraph() or (graph.is_directed() and not directed):
+        expected = "a simple networkx.Graph or DiGraph" if directed else "an undirected simple networkx.Graph"
+        raise ValueError(f"{name}: expected {expected}, got a {type(graph).__name__}")
     missing = [node for node in range(agents) if node not in graph]
     unexpected = [node for node in graph if not (isinstance(node, int | np.integer) and 0 <= node < agents)]
     if missing or unexpected:
@@ -44,24 +55,32 @@ def validate_graph(graph: nx.Graph, agents: int, name: str = "communication grap
     loops = list(nx.selfloop_edges(graph))
     if loops:
         raise ValueError(f"{name}: an agent can't be its own neighbour; remove the self-loops {_listed(loops)}")
-    if connected and not nx.is_connected(graph):
-        parts = [f"{{{_listed(sorted(part))}}}" for part in sorted(nx.connected_components(graph), key=min)]
+    both_ways = graph.to_undirected(as_view=True) if graph.is_directed() else graph
+    if connected and not nx.is_connected(both_ways):
+        parts = [f"{{{_listed(sorted(part))}}}" for part in sorted(nx.connected_components(both_ways), key=min)]
         raise ValueError(f"{name}: must be connected, but falls into {len(parts)} components: {_listed(parts)}")
-    tidy = nx.Graph()
+    tidy = nx.DiGraph() if graph.is_directed() else nx.Graph()
     tidy.add_nodes_from(range(agents))
-    tidy.add_edges_from(sorted((int(min(edge)), int(max(edge))) for edge in graph.edges))
+    edges = [(int(i), int(j)) for i, j in graph.edges]
+    tidy.add_edges_from(sorted(edges if graph.is_directed() else ((min(edge), max(edge)) for edge in edges)))
     return nx.freeze(tidy)
 
 
+def one_way_links(graph: nx.Graph) -> list[tuple[int, int]]:
+    """The links (sender, receiver) of a graph without a link back, sorted; none if it is undirected."""
+    return sorted((b, a) for b, a in graph.edges if not graph.has_edge(a, b))
+
+
 def hop_distances(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
-    """Graph distances up to `cutoff`, by breadth-first search.
+    """Graph distances up to `cutoff`, by breadth-first search, along the links of a directed graph.
 
     Args:
         graph: A validated graph on 0..N-1.
         cutoff: Largest distance of interest, in hops.
 
     Returns:
-        For each agent, {agent: distance} of the agents within `cutoff` hops, itself included at 0, nearest first.
+        For each agent, {agent: distance} of the agents that it reaches within `cutoff` hops, itself included at 0,
+        nearest first.
 
     Raises:
         ValueError: The cutoff isn't an integer.
@@ -70,6 +89,18 @@ def hop_distances(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
     neighbors = [list(graph.adj[node]) for node in range(len(graph))]
     sets = [frozenset(adjacent) for adjacent in neighbors]
     return [_reached_from(source, cutoff, neighbors, sets) for source in range(len(neighbors))]
+
+
+def hops_from_targets(graph: nx.Graph, cutoff: int) -> list[dict[int, int]]:
+    """For each agent, {target: distance} of the agents that reach it within `cutoff` hops, itself included at 0.
+
+    In an undirected graph these are `hop_distances`; in a directed one an agent may be known to others that it doesn't
+    know.
+
+    Raises:
+        ValueError: The cutoff isn't an integer.
+    """
+    return hop_distances(graph.reverse() if graph.is_directed() else graph, cutoff)
 
 
 def _reached_from(source: int, cutoff: int, neighbors: list[list[int]], sets: list[frozenset[int]]) -> dict[int, int]:
@@ -92,7 +123,9 @@ def _reached_from(source: int, cutoff: int, neighbors: list[list[int]], sets: li
 
 
 def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[int, ...], ...]:
-    """The paper's k-hop neighbours: the agents that each agent estimates, which are those that estimate it.
+    """The paper's k-hop neighbours of each agent: the agents that estimate it.
+
+    In an undirected graph these are also the agents that it estimates.
 
     Args:
         graph: A validated graph on 0..N-1.
@@ -101,7 +134,7 @@ def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[
             estimated too (Remark 2).
 
     Returns:
-        For each agent, sorted: the agents at distance 2..k, or 1..k without relay.
+        For each agent, sorted: the agents that it reaches at distance 2..k, or 1..k without relay.
 
     Raises:
         ValueError: k isn't an integer, or leaves nothing to estimate: below 2, or below 1 without relay.
@@ -116,7 +149,7 @@ def k_hop_neighbors(graph: nx.Graph, k: int, relay: bool = True) -> tuple[tuple[
 
 
 def check_task_graph(task: nx.Graph, communication: nx.Graph, k: int) -> nx.Graph:
-    """Check that the two agents of each task edge are at most k hops apart.
+    """Check that the two agents of each task edge know each other: each is at most k hops from the other.
 
     Args:
         task: Pairs of agents that a task relates; needn't be connected.
@@ -132,6 +165,16 @@ def check_task_graph(task: nx.Graph, communication: nx.Graph, k: int) -> nx.Grap
     task = validate_graph(task, len(communication), name="task graph", connected=False)
     within = hop_distances(communication, k)
     far = [edge for edge in task.edges if edge[1] not in within[edge[0]]]
+    if communication.is_directed():
+        far = [(i, j) for edge in task.edges for i, j in (edge, edge[::-1]) if i not in within[j]]
+        listed = [f"{i} from {j}, at distance {_distance(communication, j, i)}" for i, j in far[:_LISTED]]
+        if far:
+            rest = f" and {len(far) - _LISTED} more" if len(far) > _LISTED else ""
+            raise ValueError(
+                f"task graph: both agents of an edge act on it, so that each has to be reached from the other within "
+                f"k = {k} hops along the links; these aren't: {', '.join(listed)}{rest}; remove the edges, add links "
+                "or take a larger k"
+            )
     if far:
         listed = [f"{edge} at distance {_distance(communication, *edge)}" for edge in far[:_LISTED]]
         rest = f" and {len(far) - _LISTED} more" if len(far) > _LISTED else ""

@@ -51,6 +51,11 @@ class Links:
         return {pair: number for number, pair in enumerate(pairs)}
 
     @cached_property
+    def symmetric(self) -> bool:
+        """Whether every link has a link back, as in an undirected graph."""
+        return all((receiver, sender) in self.index for sender, receiver in self.index)
+
+    @cached_property
     def senders(self) -> tuple[frozenset[int], ...]:
         """Per agent its in-neighbours: the agents that it receives from."""
         found: list[set[int]] = [set() for _ in range(self.agents)]

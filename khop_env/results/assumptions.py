@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 
 from khop_env.observers import Exponential, FloatArray, FunnelBank, Funnels
-from khop_env.physics import BandLimitedNoise, DriftingIntegrator, Gust, SingleIntegrator, Sinusoid
+from khop_env.physics import BandLimitedNoise, DriftingIntegrator, Gust, SingleIntegrator, Sinusoid, one_way_links
 from khop_env.scenarios import Scenario
 
 Status = Literal["holds", "doesn't hold", "holds by construction", "not known"]
@@ -45,13 +45,7 @@ def assumptions(scenario: Scenario) -> list[Assumption]:
         _measurable_input_map(scenario),
         _bounded_disturbance(scenario),
         _input_map(scenario),
-        Assumption(
-            "3",
-            "the graph is undirected and doesn't change; each agent knows its k-hop neighbours",
-            "holds by construction",
-            f"the graph is fixed, undirected and connected ({scenario.communication.number_of_edges()} edges), and "
-            "neighbourhoods are computed from it",
-        ),
+        _fixed_graph(scenario),
         _relay(scenario),
         _nominal_controller(scenario),
         _steady_state_bound(scenario),
@@ -126,6 +120,28 @@ def _input_map(scenario: Scenario) -> Assumption:
         )
     status: Status = "holds" if len(bounded) == len(fleet) else "not known"
     return Assumption("2", "each g is bounded (i), or its time derivative is (ii)", status, "; ".join(why))
+
+
+def _fixed_graph(scenario: Scenario) -> Assumption:
+    statement = "the graph is undirected and doesn't change; each agent knows its k-hop neighbours"
+    one_way, edges = len(one_way_links(scenario.communication)), scenario.communication.number_of_edges()
+    if one_way:
+        return Assumption(
+            "3",
+            statement,
+            "doesn't hold",
+            f"{one_way} of {edges} links go one way. In continuous time our extension of Theorems 1 to 3 holds instead "
+            "(docs/theory_graphs.md): the graph is fixed, and each target reaches its observers by the links. At the "
+            "grid points of the proximal step the funnels are kept by construction",
+        )
+    kind = f"connected, and all its {edges} links go both ways" if scenario.communication.is_directed() else None
+    return Assumption(
+        "3",
+        statement,
+        "holds by construction",
+        f"the graph is fixed, {kind or f'undirected and connected ({edges} edges)'}, and neighbourhoods are computed "
+        "from it",
+    )
 
 
 def _relay(scenario: Scenario) -> Assumption:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from khop_env.observers import DesignError, Exponential, FloatArray, Funnels, ObserverDesign, PerformanceFunction
+from khop_env.observers.design import design_rule_for
+from khop_env.physics import one_way_links
 from khop_env.results.assumptions import assumptions
 from khop_env.scenarios import Scenario
 from khop_env.simulation.plant import parts_of_step
@@ -19,12 +21,15 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
     Returns:
         feasible: True if all conditions of the observers that can be checked before the start hold; otherwise `error`
             names the violated condition.
+        edges: number of edges of the communication graph, or of links if it is directed; one_way_links: number of links
+            without the opposite link.
         design_rule: from the bounds delta and theta to the funnels rho and omega.
-        targets: per estimated agent: its k-hop set, eta, lambda_min and lambda_max of M_i, own_bound, the smallest and
-            the largest of its observers' own guaranteed bounds over delta (theta), and under `state` and `input` per
-            group of components with equal numbers: delta and rho (theta and omega), each with initial and final value
-            and rate, and start_share, the largest |xi(0)| / rho(0) over the initial set; null if |g| is unbounded, so
-            that only `Simulator.reset` can check it.
+        targets: per estimated agent: its k-hop set, eta, lambda_min and lambda_max of M_i (moduli of its eigenvalues on
+            directed graphs), own_bound, the smallest and the largest of its observers' own guaranteed bounds over
+            delta (theta), and under `state` and `input` per group of components with equal numbers: delta and rho
+            (theta and omega), each with initial and final value and rate, and start_share, the largest
+            |xi(0)| / rho(0) over the initial set; null if |g| is unbounded, so that only `Simulator.reset` can check
+            it.
         pairs: number of observer-target pairs; estimates: number of estimated components.
         explicit_step_bound_s: upper bound on stable explicit Euler steps at steady state (accurate steps are far
             shorter): the smallest over all targets, for both kinds of observers.
@@ -38,9 +43,10 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
         "description": scenario.description,
         "agents": len(scenario.models),
         "edges": scenario.communication.number_of_edges(),
+        "one_way_links": len(one_way_links(scenario.communication)),
         "k": scenario.k,
         "relay": scenario.relay,
-        "design_rule": scenario.design_rule,
+        "design_rule": design_rule_for(scenario.communication, scenario.design_rule),
         "feasible": False,
         "error": None,
         "pairs": None,

@@ -13,6 +13,7 @@ import tomlkit
 from tomlkit.items import Array, Table
 
 from khop_env.observers import Bound, Exponential
+from khop_env.observers.design import design_rule_for
 from khop_env.physics import DISTURBANCES, MODELS, AgentModel, Term
 from khop_env.scenarios.scenario import Scenario
 
@@ -44,6 +45,8 @@ def write_scenario(scenario: Scenario) -> str:
         ("figure_agent", "index of the agent whose estimates figures show"),
     ):
         content = getattr(scenario, name)
+        if name == "design_rule":
+            content = design_rule_for(scenario.communication, content)
         if content is not None:
             value = tomlkit.item(_plain(content))
             document.add(name, value.comment(comment) if comment else value)
@@ -64,7 +67,8 @@ def write_scenario(scenario: Scenario) -> str:
         document,
         "communication",
         _edges(scenario.communication),
-        "The communication graph, which must be connected: an edge joins two neighbours.",
+        "The communication graph, which must be connected: an edge joins two neighbours. With directed = true an edge",
+        "[b, a] is a link that goes one way: agent a hears agent b.",
     )
     _section(
         document,
@@ -156,7 +160,12 @@ def _box(values: np.ndarray) -> Any:
 
 def _edges(graph: nx.Graph) -> Table:
     table = tomlkit.table()
-    table.add("edges", _lines(sorted([min(edge), max(edge)] for edge in graph.edges), _EDGES_A_LINE))
+    edges = [list(edge) for edge in graph.edges]
+    if graph.is_directed():
+        table.add("directed", True)
+    else:
+        edges = [sorted(edge) for edge in edges]
+    table.add("edges", _lines(sorted(edges), _EDGES_A_LINE))
     return table
 
 

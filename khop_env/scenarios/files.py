@@ -74,7 +74,7 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
         "name": root.take("name", str),
         "description": root.take("description", str, ""),
         "k": root.take("k", int),
-        "design_rule": root.take("design_rule", DesignRule, defaults["design_rule"]),
+        "design_rule": root.take("design_rule", DesignRule, None),
         **{key: root.take(key, type(defaults[key]), defaults[key]) for key in ("relay", "duration", "dt", "order")},
         "figure_agent": root.take("figure_agent", int, None),
     }
@@ -100,7 +100,12 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
     models, auto = values["models"], set[tuple[str, str | None]]()
     types = {model.type: model.n for model in models}
     with root.gathering():
-        values["communication"] = _graph(tables["communication"], len(models), validate_graph)
+        values["communication"] = _graph(
+            tables["communication"],
+            len(models),
+            lambda graph, agents: validate_graph(graph, agents, directed=True),
+            may_be_directed=True,
+        )
     with root.gathering():
         communication = values.get("communication")
         known = communication is not None and k is not REQUIRED  # otherwise hop distances can't be checked
@@ -235,7 +240,9 @@ def _shape(shape: tuple[int, ...]) -> str:
     return {1: "{} numbers", 2: "{} lists of {}"}.get(len(shape), "lists of different lengths").format(*shape)
 
 
-def _graph(table: CheckedTable, agents: int, check: Callable[[nx.Graph, int], nx.Graph]) -> nx.Graph:
+def _graph(
+    table: CheckedTable, agents: int, check: Callable[[nx.Graph, int], nx.Graph], may_be_directed: bool = False
+) -> nx.Graph:
     edges = table.take("edges", tuple[Any, ...])
     edges = () if edges is REQUIRED else edges
     for i, edge in enumerate(edges):
@@ -246,8 +253,9 @@ def _graph(table: CheckedTable, agents: int, check: Callable[[nx.Graph, int], nx
             )
         elif edge[0] == edge[1]:
             table.note(f"edges[{i}]", f"got {list(edge)}, but an agent can't be its own neighbour; remove it")
+    directed = may_be_directed and table.take("directed", bool, False)
     table.finish()
-    graph = nx.Graph()
+    graph = nx.DiGraph() if directed else nx.Graph()
     graph.add_nodes_from(range(agents))
     graph.add_edges_from(edges)
     with table.built("edges"):

@@ -23,7 +23,7 @@ from khop_env.observers import (
     Proximal,
     TargetObservers,
 )
-from khop_env.observers.design import require_design_rule
+from khop_env.observers.design import design_rule_for
 from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
 from khop_env.simulation import InitialSet, Law, Observe, Simulator
 
@@ -52,13 +52,15 @@ class Scenario:
         name: of the scenario, also of its folder of results.
         description: one line.
         models: one agent model per agent; neighbours with equal models are evaluated together.
-        communication: the communication graph; nodes 0..N-1, connected.
+        communication: the communication graph; nodes 0..N-1, connected. A networkx.DiGraph for links that go one way,
+            with an edge b -> a where agent a hears agent b.
         task: the task graph: pairs of agents that should agree, on the same nodes, within k hops.
         k: agents up to k hops away are estimated.
         relay: whether agents relay their neighbours' states (the paper's Assumption 4).
         delta: bounds on the state estimation errors.
         theta: bounds on the input estimation errors, where there are input observers.
-        design_rule: from these bounds to the funnels on the disagreements: "paper", or "sharp" for the widest ones.
+        design_rule: from these bounds to the funnels on the disagreements: "paper", or "sharp" for the widest ones;
+            None for the default of `ObserverDesign`.
         observers: per agent the options of its observers; None for the default of `ObserverDesign`.
         disturbance: w_i(x, t), or None.
         center: (n,) centre of the box that states start in, and the observers' first guess.
@@ -81,7 +83,7 @@ class Scenario:
     k: int
     delta: Bounds
     theta: Bounds | None = None
-    design_rule: DesignRule = "paper"
+    design_rule: DesignRule | None = None
     relay: bool = True
     observers: tuple[TargetObservers, ...] | None = None
     disturbance: Disturbance | None = None
@@ -97,7 +99,11 @@ class Scenario:
         self._check_values()
         agents = len(self.models)
         # copies without attributes: an edge counts once, whatever weight it carries
-        object.__setattr__(self, "communication", validate_graph(self.communication, agents))
+        object.__setattr__(self, "communication", validate_graph(self.communication, agents, directed=True))
+        try:
+            design_rule_for(self.communication, self.design_rule)
+        except ValueError as error:
+            raise ValueError(f"scenario {self.name!r}: {error}") from None
         object.__setattr__(self, "task", check_task_graph(self.task, self.communication, self.k))
         for name in ("center", "radius"):
             values = np.asarray(getattr(self, name), dtype=float)
@@ -127,10 +133,6 @@ class Scenario:
             for value in values:
                 if not isinstance(value, bool | np.bool):
                     raise ValueError(f"scenario {self.name!r}: {what} must be True or False; got {value!r}")
-        try:
-            require_design_rule(self.design_rule)
-        except ValueError as error:
-            raise ValueError(f"scenario {self.name!r}: {error}") from None
         if self.order not in (1, 2):
             raise ValueError(f"scenario {self.name!r}: order must be 1 or 2; got {self.order!r}")
         if not 0 < len(self.models) <= MOST_AGENTS:

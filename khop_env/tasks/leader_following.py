@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from khop_env.observers import FloatArray, IntArray
-from khop_env.physics import AgentModel, Fleet, did_you_mean, hop_distances, velocity_to_input
+from khop_env.physics import AgentModel, Fleet, did_you_mean, hop_distances, hops_from_targets, velocity_to_input
 from khop_env.tasks.base import Signature, World
 from khop_env.tasks.edges import EdgeTask, require_positive, ring
 
@@ -48,9 +48,8 @@ class LeaderFollowing(EdgeTask):
 
     def bind(self, world: World) -> None:
         """Choose leaders, assign followers, and make room for the routes."""
-        hops = hop_distances(world.design.communication, world.design.k)
-        fleet = world.fleet
-        chosen = _choose_leaders(fleet, hops, self.leaders)
+        graph, k, fleet = world.design.communication, world.design.k, world.fleet
+        chosen = _choose_leaders(fleet, hop_distances(graph, k), self.leaders)
         if not chosen or len(chosen) == len(fleet):
             raise ValueError(
                 f"leader following needs at least one leader and one follower; got {len(chosen)} leaders of "
@@ -64,7 +63,7 @@ class LeaderFollowing(EdgeTask):
         self.speeds = tuple(
             float(_speed(fleet.models[i])) if self.leader_speed is None else float(self.leader_speed) for i in chosen
         )
-        self._pairs = _assign_followers(fleet, hops, chosen, dict(self.follow or {}))
+        self._pairs = _assign_followers(fleet, hops_from_targets(graph, k), chosen, dict(self.follow or {}))
         super().bind(world)
         shape = len(chosen), fleet.position_dim
         self.memory = {

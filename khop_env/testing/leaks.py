@@ -26,7 +26,7 @@ def leak(subject: Subject) -> None:
     hops = dict(nx.all_pairs_shortest_path_length(design.communication))
     reach = design.k if mode == "oracle" else 1
     for j, agent in enumerate(fleet.ids):
-        near = {i for i in range(len(fleet)) if hops[i].get(j, np.inf) <= reach}
+        near = {i for i in range(len(fleet)) if hops[j].get(i, np.inf) <= reach}
         _require(env, near, f"the true state of {agent!r}", lambda state: state.simulator.x, [fleet.state_slice(j)])
         _require(env, {j}, f"the input in force of {agent!r}", lambda state: state.inputs, [fleet.input_slice(j)])
         made = [

@@ -69,6 +69,20 @@ class TestFrame:
         assert near(at(drawn, moved, (2, 0)), BLUE)
         assert not near(at(drawn, moved, (0, 0)), BLUE)
 
+    @pytest.mark.parametrize("link", [(1, 2), (2, 1)])
+    def test_links_that_go_one_way_have_an_arrow_at_the_receiver(self, link):
+        """On the path 0, 1, 2 from left to right, of which the first link goes both ways."""
+        graph = nx.DiGraph([(0, 1), (1, 0), link])
+        drawn = Renderer(design(graph=graph), np.zeros((0, 2), int))
+        estimates = np.zeros(design(graph=graph).states.layout.size)
+        frame = drawn.frame(0.0, np.array([0.0, 0.0, 3.0, 0.0, 6.0, 0.0]), estimates, 0.5)
+        for agent, marked in ((1, False), (2, link == (1, 2))):
+            x, y = drawn._camera.pixels(np.array([3.0 * agent, 0.0])).round().astype(int)
+            beside = frame[[y - 2, y + 2], round(x - 1.6 * drawn._radius - 7.0), 0]  # of the line to the left
+            assert np.all(beside < 160) == marked
+            assert np.all(beside > 200) != marked
+            assert frame[y, x - 60, 0] < 160
+
     def test_north_is_up(self):
         drawn = renderer()
         drawn.frame(*scene())

@@ -179,7 +179,7 @@ def test_designs_that_no_theorem_covers_are_refused(fleet, delta, theta, targets
     ("graph", "k", "message"),
     [
         (nx.Graph([(0, 1), (2, 3)]), 2, "falls into 2 components"),
-        (nx.path_graph(4, create_using=nx.DiGraph), 2, "undirected"),
+        (nx.MultiGraph([(0, 1), (1, 2), (2, 3)]), 2, "expected a simple networkx.Graph or DiGraph, got a MultiGraph"),
         (nx.path_graph(5), 2, "integers 0 to 3"),
         (TREE, 1, "k must be at least 2 with relay"),
     ],

@@ -18,6 +18,9 @@ STEPS = st.floats(np.log(1e-4), 0.0).map(lambda exponent: float(np.exp(exponent)
 """Any step from 1e-4 s to 1 s, as likely in each decade."""
 
 
+SYSTEMS = systems() | systems(directed=True)
+
+
 def has_vessels(system: System) -> bool:
     """True if the fleet has agents whose drift grows with the square of a state."""
     return any(isinstance(model, SurfaceVessel) for model in system.design.fleet.models)
@@ -34,15 +37,15 @@ def assert_inside(simulator: Simulator) -> None:
 
 @pytest.mark.parametrize("order", [1, 2])
 @settings(max_examples=150)
-@given(system=systems(), dt=STEPS, decades=st.floats(-1.0, 3.0), vary=st.booleans(), batch=st.integers(1, 3))
+@given(system=SYSTEMS, dt=STEPS, decades=st.floats(-1.0, 3.0), vary=st.booleans(), batch=st.integers(1, 3))
 def test_funnels_are_kept_for_any_step_and_any_jump_of_input_and_state(order, system, dt, decades, vary, batch):
     """|xi+| < rho(t+) for every tau > 0, every predictor and every jump of x_i, u_i or rho.
 
-    Random graphs, relay or not, fleets, funnels, observers with and without f and g_hat, and disturbances. Before each
-    step every state and every input jumps to somewhere else, up to a thousand metres away; the step may change too.
-    Vessels jump by 1 (m, rad, m/s, rad/s) at most: their drift is quadratic, and steps are divided for velocities that
-    they can come to by themselves. What a step makes of 10 m/s sends the next predictor 1e8 m away, where the rounding
-    of a position is felt in a funnel of a centimetre.
+    Random graphs, directed or not, relay or not, fleets, funnels, observers with and without f and g_hat, and
+    disturbances. Before each step every state and every input jumps to somewhere else, up to a thousand metres away;
+    the step may change too. Vessels jump by 1 (m, rad, m/s, rad/s) at most: their drift is quadratic, and steps are
+    divided for velocities that they can come to by themselves. What a step makes of 10 m/s sends the next predictor 1e8
+    m away, where the rounding of a position is felt in a funnel of a centimetre.
     """
     simulator = system.simulator(Proximal(order), batch)
     assert_inside(simulator)
@@ -57,7 +60,7 @@ def test_funnels_are_kept_for_any_step_and_any_jump_of_input_and_state(order, sy
 
 @pytest.mark.parametrize("order", [1, 2])
 @settings(max_examples=60)
-@given(system=systems(input_observer=True), dt=STEPS)
+@given(system=systems(input_observer=True) | systems(input_observer=True, directed=True), dt=STEPS)
 def test_funnels_are_kept_from_the_start_under_inputs_at_their_limits(order, system, dt):
     """The same for what a policy can do: inputs that flip between their limits every step, states that follow."""
     simulator = system.simulator(Proximal(order), 2)
@@ -149,7 +152,7 @@ class TestStepsThatTheDriftCannotTake:
 
 
 @settings(max_examples=60)
-@given(system=systems(), dt=STEPS, where=st.floats(0.0, 1.0))
+@given(system=SYSTEMS, dt=STEPS, where=st.floats(0.0, 1.0))
 def test_an_episode_may_resume_anywhere(system, dt, where):
     """From a restored state whose estimates lie anywhere, outside their funnels too, one step leads inside."""
     simulator = system.simulator(Proximal(), 2)

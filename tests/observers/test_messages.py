@@ -21,7 +21,7 @@ def derivatives(simulator):
 
 
 @settings(max_examples=40)
-@given(system=systems())
+@given(system=systems() | systems(directed=True))
 def test_messages_equal_the_batch_to_rounding(system):
     """Equations of the disagreements, of the state observer and of the input observer, written per agent."""
     simulator = system.simulator(Proximal(2), num_envs=2)

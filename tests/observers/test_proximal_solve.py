@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from khop_env.observers import PairLayout
 from khop_env.observers.solve import LANES, MAX_ITERATIONS, solve
 from khop_env.physics import Links, k_hop_neighbors
-from tests.strategies import SEEDS, connected_graphs, hops
+from tests.strategies import SEEDS, connected_graphs, digraphs, hops
 
 
 def layout_of(graph, k, relay, dimensions=None):
@@ -78,7 +78,7 @@ def check_solution(layout, tau, predictor, source, rho, estimate, eps, slope):
 
 
 @settings(max_examples=200)
-@given(graph=connected_graphs(smallest=2, largest=13), about=hops(), seed=SEEDS)
+@given(graph=connected_graphs(smallest=2, largest=13) | digraphs(smallest=2, largest=13), about=hops(), seed=SEEDS)
 def test_stress_one_component_converges_from_anywhere(graph, about, seed):
     """A solution for every tau > 0, every predictor and every jump, and Newton finds it.
 
@@ -102,7 +102,10 @@ def test_stress_one_component_converges_from_anywhere(graph, about, seed):
 
 
 @given(
-    graph=connected_graphs(), about=hops(), dimensions=st.lists(st.integers(1, 6), min_size=9, max_size=9), seed=SEEDS
+    graph=connected_graphs() | digraphs(),
+    about=hops(),
+    dimensions=st.lists(st.integers(1, 6), min_size=9, max_size=9),
+    seed=SEEDS,
 )
 def test_moderate_jumps_end_strictly_inside(graph, about, dimensions, seed):
     """The open funnel |xi+| < rho holds for xi recomputed from the estimates, up to rounding; any n_i."""
@@ -113,10 +116,10 @@ def test_moderate_jumps_end_strictly_inside(graph, about, dimensions, seed):
     assert np.all(check_solution(layout, tau, predictor, source, rho, estimate, eps, slope))
 
 
-@given(graph=connected_graphs(), about=hops(), seed=SEEDS, spread=st.sampled_from([0.1, 3.0, 20.0]))
+@given(graph=connected_graphs() | digraphs(), about=hops(), seed=SEEDS, spread=st.sampled_from([0.1, 3.0, 20.0]))
 def test_solution_does_not_depend_on_the_warm_start(graph, about, seed, spread):
-    """The objective is strictly convex: one solution, whichever feasible point Newton starts from; |eps| = 20 is a
-    disagreement within 4e-9 of the wall.
+    """The objective is strictly convex, or the equation that of an M-function: one solution, whichever feasible point
+    Newton starts from; |eps| = 20 is a disagreement within 4e-9 of the wall.
     """
     layout = layout_of(graph, *about)
     rng = np.random.default_rng(seed)
@@ -133,7 +136,7 @@ def test_solution_does_not_depend_on_the_warm_start(graph, about, seed, spread):
 
 @settings(max_examples=40)
 @given(
-    graph=connected_graphs(largest=7),
+    graph=connected_graphs(largest=7) | digraphs(largest=7),
     about=hops(),
     dimensions=st.lists(st.integers(1, 6), min_size=7, max_size=7),
     batch=st.sampled_from([1, 2, 3, LANES - 1, LANES + 1, 2 * LANES + 3]),
@@ -160,7 +163,7 @@ def test_every_environment_and_target_is_solved_as_if_alone(graph, about, dimens
         np.testing.assert_array_equal(ours, split)
 
 
-@given(graph=connected_graphs(), about=hops(), seed=SEEDS)
+@given(graph=connected_graphs() | digraphs(), about=hops(), seed=SEEDS)
 def test_the_predictor_may_be_overwritten(graph, about, seed):
     """Estimates written over the predictor are those written elsewhere: the simulator steps in place."""
     layout = layout_of(graph, *about)

@@ -32,8 +32,8 @@ class Bounds:
             m = definition_of_m(graph, observers_of(layout, index), block.agent, relay)
             self.m[block.columns, block.columns] = np.kron(m, np.eye(block.components))
             sums = np.linalg.inv(m).sum(axis=1)
-            gain = np.linalg.eigvalsh(m)[0] / np.sqrt(block.observers)
-            gain = gain if system.design.design_rule == "paper" else 1.0 / sums.max()
+            sharp = system.design.design_rule == "sharp"
+            gain = 1.0 / sums.max() if sharp else np.linalg.eigvalsh(m)[0] / np.sqrt(block.observers)
             self.own[block.columns] = np.repeat(sums * gain, block.components)
             columns += block.observers * [(f.initial, f.final, f.rate, gain) for f in given_bounds[block.agent]]
         self.initial, self.final, self.rate, self.gain = np.array(columns).reshape(-1, 4).T
@@ -47,7 +47,7 @@ class Bounds:
         assert np.all(np.abs(difference) < self.gain * delta), (
             f"t = {t}: {np.max(np.abs(difference) / self.gain / delta)}"
         )
-        np.testing.assert_allclose(difference, error @ self.m, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(difference, error @ self.m.T, rtol=0, atol=1e-9)
 
 
 def run(system: System, integrator: str, law: object | None) -> Simulator:
@@ -73,9 +73,14 @@ def run(system: System, integrator: str, law: object | None) -> Simulator:
 
 
 def draw_system(data: st.DataObject, integrator: str, **options: object) -> System:
-    """Wide funnels for the explicit step, which would need 1e-5 s in narrow ones."""
+    """Graphs directed or not; wide funnels for the explicit step, which would need 1e-5 s in narrow ones."""
+    directed = data.draw(st.booleans())
     return data.draw(
-        systems(**options, **({} if integrator == "proximal" else {"floor": 3.0, "margin": 2.0, "largest": 6}))
+        systems(
+            directed=directed,
+            **options,
+            **({} if integrator == "proximal" else {"floor": 3.0, "margin": 2.0, "largest": 6}),
+        )
     )
 
 

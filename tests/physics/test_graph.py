@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from khop_env.physics import (
     check_task_graph,
     hop_distances,
+    hops_from_targets,
     k_hop_neighbors,
+    one_way_links,
     paper_tree,
     random_geometric_graph,
     validate_graph,
@@ -47,6 +49,47 @@ def test_k_hop_neighbors_are_those_at_distance_2_to_k(graph: nx.Graph, k: int) -
     for nearest, relay in ((2, True), (1, False)):
         expected = tuple(tuple(j for j in graph if nearest <= distance[i].get(j, math.inf) <= k) for i in graph)
         assert k_hop_neighbors(graph, k, relay) == expected
+
+
+DIGRAPHS = st.builds(
+    lambda n, p, seed: nx.gnp_random_graph(n, p, seed=seed, directed=True),
+    st.integers(1, 14),
+    st.floats(0, 0.5),
+    st.integers(0, 10**6),
+)
+
+
+@given(graph=DIGRAPHS, k=st.integers(2, 6))
+def test_hops_in_a_directed_graph_follow_the_links(graph: nx.DiGraph, k: int) -> None:
+    """From a target to those that estimate it, and for an observer from the agents that reach it."""
+    distance = dict(nx.all_pairs_shortest_path_length(graph, k))
+    assert hop_distances(graph, k) == [distance[i] for i in graph]
+    assert hops_from_targets(graph, k) == [{j: distance[j][i] for j in graph if i in distance[j]} for i in graph]
+    for nearest, relay in ((2, True), (1, False)):
+        expected = tuple(tuple(j for j in graph if distance[i].get(j, 0) >= nearest) for i in graph)
+        assert k_hop_neighbors(graph, k, relay) == expected
+    assert one_way_links(graph) == sorted((i, j) for i, j in graph.edges if (j, i) not in graph.edges)
+
+
+def test_a_directed_graph_is_validated_where_it_is_allowed() -> None:
+    """Weakly connected, so that a link may lead to agents that lead nowhere; direction and order are kept."""
+    tidy = validate_graph(nx.DiGraph([(3, 1), (1, 0), (0, 1), (0, 2)]), 4, directed=True)
+    assert list(tidy) == [0, 1, 2, 3]
+    assert list(tidy.edges) == [(0, 1), (0, 2), (1, 0), (3, 1)]
+    assert one_way_links(tidy) == [(0, 2), (3, 1)]
+    with pytest.raises(ValueError, match=r"falls into 2 components: \{0, 1\}, \{2, 3\}"):
+        validate_graph(nx.DiGraph([(0, 1), (3, 2)]), 4, directed=True)
+    with pytest.raises(ValueError, match=r"expected a simple networkx.Graph or DiGraph, got a MultiDiGraph"):
+        validate_graph(nx.MultiDiGraph([(0, 1)]), 2, directed=True)
+
+
+def test_task_edges_on_a_directed_graph_need_both_directions() -> None:
+    ring = validate_graph(nx.cycle_graph(6, create_using=nx.DiGraph), 6, directed=True)
+    opposite = nx.empty_graph(6)
+    opposite.add_edges_from([(0, 3), (1, 4)])
+    assert set(check_task_graph(opposite, ring, 3).edges) == {(0, 3), (1, 4)}
+    with pytest.raises(ValueError, match=r"k = 2 hops.*: 0 from 3, at distance 3, 3 from 0, .*add links"):
+        check_task_graph(opposite, ring, 2)
 
 
 def test_direct_neighbors_of_a_triangle_are_not_two_hops_away() -> None:

@@ -51,6 +51,15 @@ def draw_task_edge(canvas: Canvas, ends: FloatArray, unit: float, thin: float, *
     canvas.dashes(ends[0], ends[1], TASK_COLOR, 2.0 * thin, 6.0 * unit, 5.0 * unit)
 
 
+def draw_arrow_head(canvas: Canvas, ends: FloatArray, before: float, unit: float) -> None:
+    """The head of a one-way link, from the first of two points (2, 2) to the second, `before` pixels ahead of it."""
+    along = ends[1] - ends[0]
+    along = along / max(float(np.hypot(*along)), 1e-9)
+    tip, across = ends[1] - before * along, np.array([-along[1], along[0]])
+    back = tip - 9.0 * unit * along
+    canvas.polygon(np.array([tip, back + 4.0 * unit * across, back - 4.0 * unit * across]), EDGE_COLOR)
+
+
 class Panel:
     """The strip: constant contents as arguments, and those that change in `draw`.
 

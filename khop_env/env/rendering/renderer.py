@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from khop_env.env.rendering.camera import Camera, Labels
 from khop_env.env.rendering.canvas import Canvas, Window
 from khop_env.env.rendering.on_map import OnMap
-from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
+from khop_env.env.rendering.panel import Panel, draw_agent, draw_arrow_head, draw_task_edge
 from khop_env.env.rendering.scene import (
     EDGE_COLOR,
     PALE,
@@ -30,6 +30,7 @@ from khop_env.env.rendering.scene import (
     undirected,
 )
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
+from khop_env.physics import one_way_links
 from khop_env.tasks import MapCanvas, Task, World
 
 Decorate = Callable[[MapCanvas], None]
@@ -41,9 +42,9 @@ _FADES = 8  # shades of a trail
 class Renderer:
     """Draws the state of a fleet as pictures, or in a window.
 
-    Agents by type, communication edges solid and task edges dashed; for one agent its estimates: hollow markers at
-    the estimated positions of its targets, each in the box that is guaranteed to hold the target. Fleets in space are
-    seen from above, fleets on a line have a row for each agent.
+    Agents by type, communication edges solid, with an arrow where a link goes one way, and task edges dashed; for one
+    agent its estimates: hollow markers at the estimated positions of its targets, each in the box that is guaranteed to
+    hold the target. Fleets in space are seen from above, fleets on a line have a row for each agent.
 
     Args:
         design: the observers, with the fleet and the communication graph.
@@ -83,6 +84,7 @@ class Renderer:
         self.observer = default_observer(design, task_edges) if observer is None else fleet.agent(observer)
         self._estimates = Estimates(design, self.observer)
         self._edges = undirected(np.array(design.communication.edges, int).reshape(-1, 2))
+        self._one_way = one_way_links(design.communication)
         self._tasks, self._neighbors = undirected(task_edges), frozenset(self._edges)
         self._headings = headings(fleet)
         self._looks = looks(fleet.models)
@@ -331,6 +333,9 @@ class Renderer:
         for i, j in self._edges:
             if np.isfinite(middles[[i, j]]).all():
                 canvas.line(middles[[i, j]], EDGE_COLOR, 2.0 * self._thin)
+        for sender, receiver in self._one_way:
+            if np.isfinite(middles[[sender, receiver]]).all():
+                draw_arrow_head(canvas, middles[[sender, receiver]], 1.6 * self._radius, self._thin)
         for i, j in self._tasks:
             if np.isfinite(middles[[i, j]]).all():
                 draw_task_edge(canvas, middles[[i, j]], self._unit, self._thin, beside=(i, j) in self._neighbors)
