@@ -41,7 +41,6 @@ class PairArrays(NamedTuple):
         entry: (entries,) places within the target of the observers whose estimates the observer receives: the
             off-diagonal -1 entries of M_i.
         first: (pairs,) place of the first non-zero of each row of M_i (its lower profile).
-        column_sum: (pairs,) sum of each column of M_i; as `relay`, the sum of each row, where M_i is symmetric.
         last: (pairs,) place of the last non-zero of each row of M_i's factor U; empty if all links go both ways.
     """
 
@@ -56,7 +55,6 @@ class PairArrays(NamedTuple):
     entry_start: IntArray
     entry: IntArray
     first: IntArray
-    column_sum: FloatArray
     last: IntArray
 
 
@@ -141,7 +139,6 @@ class PairLayout:
         diagonal: list[int] = []
         first: list[int] = []
         last: list[int] = []
-        column_sum: list[int] = []
         entry: list[int] = []
         entry_start = [0]
         entry_link: list[int] = []
@@ -171,9 +168,6 @@ class PairLayout:
                 if not links.symmetric:
                     begin = len(last) - a
                     last.append(max([a, *linked, *last[begin + first[-1] : begin + a]]))
-            pairs = range(len(observer) - len(members), len(observer))
-            told = np.bincount(entry[entry_start[pairs.start] :], minlength=len(members)).tolist()
-            column_sum.extend(diagonal[pair] - count for pair, count in zip(pairs, told, strict=True))
             size += len(members) * dimensions[i]
             rows += dimensions[i]
         of_target = np.ascontiguousarray(np.array(blocks, dtype=np.int64).reshape(-1, 6).T)
@@ -190,7 +184,6 @@ class PairLayout:
                 entry_start=np.array(entry_start, dtype=np.int64),
                 entry=np.array(entry, dtype=np.int64),
                 first=np.array(first, dtype=np.int64),
-                column_sum=np.array(column_sum, dtype=np.float64),
                 last=np.array(last, dtype=np.int64),
             ),
             target=np.array(target, dtype=np.int64),

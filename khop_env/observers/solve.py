@@ -110,7 +110,6 @@ def _start_anew(
     pair: int,
     lanes: int,
     relay: FloatArray,
-    column_sum: FloatArray,
     scale: FloatArray,
     b: FloatArray,
     e: FloatArray,
@@ -123,8 +122,9 @@ def _start_anew(
 ) -> bool:
     """Replace a warm start that a jump of the source has made useless; return True if one was replaced.
 
-    The equations of all observers add up to sum e + s 1'M z = sum b, with 1'M 1 = sum h. Where Newton's step for a
-    common impulse would be long, every observer starts from the one common impulse that meets the sum.
+    Since M 1 = h, the equations of all observers add up to sum e + s sum h z = sum b: for a common impulse z, and for
+    any where M is symmetric. Where Newton's step for a common impulse would be long, every observer starts from the one
+    common impulse that meets the sum.
     """
     links = 0.0
     for lane in range(lanes):
@@ -132,11 +132,11 @@ def _start_anew(
         stiffness[lane] = 0.0
         total[0, lane] = 0.0
     for a in range(eta):
-        h, column = relay[pair + a], column_sum[pair + a]
+        h = relay[pair + a]
         links += h
         for lane in range(lanes):
             total[0, lane] += b[a, lane]
-            lack[lane] += b[a, lane] - e[a, lane] - scale[lane] * column * z[a, lane]
+            lack[lane] += b[a, lane] - e[a, lane] - scale[lane] * h * z[a, lane]
             # (de/dz + s h) / (deps/dz): change of the sum per unit of eps
             stiffness[lane] += 0.5 * (1.0 - e[a, lane] * e[a, lane]) + scale[lane] * h / gain[a, lane]
     far = 0.0
@@ -254,7 +254,7 @@ def solve(
             while moving:
                 _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 if iteration == 0 and _start_anew(
-                    eta, pair, lanes, relay, pairs.column_sum, scale, b, e, z, gain, u, pivot, worst, poison
+                    eta, pair, lanes, relay, scale, b, e, z, gain, u, pivot, worst, poison
                 ):
                     _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 if one_way:
