@@ -9,11 +9,15 @@ Left out is what `SLOW` lists.
 """
 
 import itertools
+import signal
 from collections.abc import Hashable
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
+
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a job in a script's background ignores Ctrl-C, and so would its
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # children, which tests interrupt
 
 PROFILE = {
     "deadline": None,
