@@ -224,7 +224,7 @@ class TestRun:
         assert "left the funnel" in found["error"]
 
     def test_a_plant_that_diverges_loses_nothing(self, folder):
-        """Points without limits under a gain far too high for their steps: the states overflow, and that is told."""
+        """Points without limits under a gain far too high for their steps: the states overflow, and it says so."""
         lines = 'name = "points"\nk = 2\n[[agents]]\nmodel = "integrator"\ncount = 4\ninput_limit = inf\n'
         edges = f"edges = {[list(edge) for edge in itertools.combinations(range(4), 2)]}\n"
         bound = "initial = 10\nfinal = 1\nrate = 5\n"

@@ -76,7 +76,7 @@ def resolved(name: str, elsewhere: str | None) -> tuple[Task | type[Task] | None
         )
     known = (*SCENARIOS, *environments())
     nearest = did_you_mean(name, known)
-    if name.isidentifier() and name not in known and any(repr(one) in nearest for one in environments()):
+    if name.isidentifier() and name not in known and any(repr(task_name) in nearest for task_name in environments()):
         raise ValueError(f"no scenario or environment {name!r}; {nearest}")
     return None, load(name)
 

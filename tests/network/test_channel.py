@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from khop_env.network import Channel, ChannelMemory, Network, PlainLink, plain_noise
 from khop_env.network.randomness import draw_keys, plain_uniform, round_key, uniform
 from khop_env.physics import Links
+from tests.strategies import SEEDS
 
 LINKS = Links.of(nx.path_graph(4))
 NETWORKS = st.builds(
@@ -23,7 +24,6 @@ NETWORKS = st.builds(
     jitter=st.floats(0, 0.2),
     period=st.sampled_from([0.005, 0.05, 0.1]),
 )
-SEEDS = st.integers(0, 2**32 - 1)
 
 
 def started(network: Network, seeds: list[int], links: Links = LINKS, width: int = 0) -> tuple[Channel, ChannelMemory]:

@@ -21,6 +21,7 @@ from khop_env.physics import (
     SurfaceVessel,
     Unicycle,
 )
+from tests.strategies import SEEDS
 
 LIMITS = st.floats(0.1, 5.0)
 MODELS = {
@@ -36,7 +37,6 @@ MODELS = {
         input_limit=st.floats(0.5, 40),
     ),
 }
-SEEDS = st.integers(0, 2**32 - 1)
 STEPS, BATCH = 200, 128
 
 

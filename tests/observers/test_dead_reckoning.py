@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from khop_env.observers import Certificate, predict
 from khop_env.observers.dead_reckoning import extended_drift
@@ -17,8 +16,8 @@ from khop_env.physics import (
     SurfaceVessel,
     Unicycle,
 )
+from tests.strategies import SEEDS
 
-SEEDS = st.integers(0, 2**32 - 1)
 DRIFTING = [DriftingIntegrator(1.0), DoubleIntegrator(4.0), SurfaceVessel()]
 
 

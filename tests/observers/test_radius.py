@@ -6,13 +6,11 @@ import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from khop_env.observers import Certificate
 from khop_env.observers.radius import FIRST, KNOTS, OCTAVES, RadiusTable, exponential
 from khop_env.physics import DoubleIntegrator, DriftingIntegrator, Growth, SingleIntegrator
-
-SEEDS = st.integers(0, 2**32 - 1)
+from tests.strategies import SEEDS
 
 
 def system(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

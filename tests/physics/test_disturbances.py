@@ -26,6 +26,7 @@ from khop_env.physics import (
     Term,
     Unicycle,
 )
+from tests.strategies import SEEDS
 
 FLEET = Fleet([DriftingIntegrator(), DoubleIntegrator(), DoubleIntegrator(), SurfaceVessel(), Unicycle()])
 EVERY: dict[str, Disturbance] = {
@@ -36,7 +37,6 @@ EVERY: dict[str, Disturbance] = {
 }
 EVERY["sum"] = EVERY["sinusoid"] + EVERY["noise"] + EVERY["gust"] + EVERY["coupling"]
 EACH = pytest.mark.parametrize("disturbance", EVERY.values(), ids=EVERY)
-SEEDS = st.integers(0, 2**32 - 1)
 
 
 def evaluate(disturbance: Disturbance, seed: int, batch: int, fleet: Fleet = FLEET) -> tuple[FloatArray, ...]:

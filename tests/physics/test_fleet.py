@@ -15,6 +15,7 @@ from khop_env.physics import (
     SurfaceVessel,
     Unicycle,
 )
+from tests.strategies import SEEDS
 
 
 class Swing(AgentModel):
@@ -53,7 +54,6 @@ MODELS = [
     Swing(),
 ]
 MIXED = st.lists(st.sampled_from(MODELS), min_size=1, max_size=9)
-SEEDS = st.integers(0, 2**32 - 1)
 
 
 @given(models=MIXED, seed=SEEDS, batch=st.integers(0, 4))

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 
 from khop_env.physics import (
     MODELS,
@@ -18,9 +17,9 @@ from khop_env.physics import (
     SurfaceVessel,
     Unicycle,
 )
+from tests.strategies import SEEDS
 
 LIBRARY = pytest.mark.parametrize("model", [kind() for kind in MODELS.values()], ids=list(MODELS))
-SEEDS = st.integers(0, 2**32 - 1)
 REGION = np.array([math.inf, math.inf, math.inf, 1.5, 0.7, 0.4])
 
 

@@ -23,9 +23,9 @@ from khop_env.physics import (
     drifting_integrator_drift,
 )
 from khop_env.scenarios import mixed_fleet
+from tests.strategies import SEEDS
 
 LIBRARY = pytest.mark.parametrize("model", [kind() for kind in MODELS.values()], ids=list(MODELS))
-SEEDS = st.integers(0, 2**32 - 1)
 
 
 class Pendulum(AgentModel):
