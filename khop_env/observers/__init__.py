@@ -5,9 +5,11 @@ Everything with rho, xi, eps, a guaranteed bound, or a hat over x or g is here. 
 """
 
 from khop_env.observers.base import (
+    Assumptions,
     Certified,
     Extremes,
     FunnelObservers,
+    Information,
     Memory,
     Observers,
     Plant,
@@ -32,6 +34,7 @@ from khop_env.observers.performance import Exponential, FunnelBank, PerformanceF
 from khop_env.observers.proximal import Proximal
 
 __all__ = [
+    "Assumptions",
     "BatchedRightHandSide",
     "Bound",
     "Box",
@@ -48,6 +51,7 @@ __all__ = [
     "FunnelError",
     "FunnelObservers",
     "Funnels",
+    "Information",
     "IntArray",
     "Memory",
     "MessagePassing",

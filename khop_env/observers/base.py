@@ -8,20 +8,21 @@ together with it, stage by stage.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.disagreement import largest_ratios
-from khop_env.observers.layout import FloatArray, IntArray
+from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 from khop_env.observers.performance import FunnelBank
 from khop_env.physics import Fleet
 
-Memory = dict[str, FloatArray]
+Memory = dict[str, NDArray[Any]]
 """Memory of observers by name, batch last; "estimate" (P, B) and "input_estimate" (Q, B) always."""
 
-Basis = Literal["theorem", "construction"]
+Basis = Literal["theorem", "construction", "certificate"]
 
 
 class SolveError(RuntimeError):
@@ -82,11 +83,40 @@ class Certified(NamedTuple):
 
     Attributes:
         bound: (P, B) in the units of the estimates.
-        basis: "theorem": the paper's, in continuous time; or "construction": of the step, at every grid point.
+        basis: "theorem": the paper's, in continuous time; "construction": of the step, at every grid point; or
+            "certificate": of the age of what was received, whatever the network does.
     """
 
     bound: FloatArray
     basis: Basis
+
+
+class Assumptions(NamedTuple):
+    """What a guarantee may assume of the plant.
+
+    Attributes:
+        center: (n,) centre of the initial set.
+        radius: (n,) its half widths.
+        disturbance: (n,) bound on |w|, in state units per second.
+    """
+
+    center: FloatArray
+    radius: FloatArray
+    disturbance: FloatArray
+
+
+class Information(NamedTuple):
+    """What observers that exchange messages know of their targets, per pair of their layout.
+
+    Attributes:
+        age: (pairs, B) time since the newest state that has arrived was measured, in s; inf where none has.
+        hops: (pairs, B) links over which it came; 0 where none has.
+        since: (pairs, B) time since it arrived, in s; inf where none has.
+    """
+
+    age: FloatArray
+    hops: FloatArray
+    since: FloatArray
 
 
 class Observers(Protocol):
@@ -95,17 +125,23 @@ class Observers(Protocol):
     Attributes:
         name: e.g. "proximal".
         order: of convergence in the step.
+        by_messages: whether agents know of others, neighbours included, by messages only, which can be lost or late.
+        layout: of the pairs (observer, target) that "estimate" is about, once prepared. Neighbours are among the
+            targets where `by_messages`.
     """
 
     name: str
     order: int
+    by_messages: bool
+    layout: PairLayout
 
-    def prepare(self, design: ObserverDesign, num_envs: int) -> None:
+    def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
         """Get ready; called once, before everything else.
 
         Args:
             design: the pairs (observer, target) and their funnels.
             num_envs: number of environments B.
+            assumed: of the plant.
         """
         ...
 
@@ -143,6 +179,10 @@ class Observers(Protocol):
 
     def bound(self, state: PlantState, out: FloatArray) -> Certified:
         """The guaranteed bound on the error of each of a state's estimates, written into `out` (P, B)."""
+        ...
+
+    def information(self, state: PlantState) -> Information:
+        """Age and way of what is known; called where `by_messages`."""
         ...
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
@@ -208,10 +248,11 @@ class FunnelObservers:
     """
 
     basis: Basis = "theorem"
+    by_messages = False
 
-    def prepare(self, design: ObserverDesign, num_envs: int) -> None:
-        """Allocate the buffers for steps of `design` in `num_envs` environments."""
-        self.design, self.num_envs = design, num_envs
+    def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
+        """Allocate the buffers for steps of `design` in `num_envs` environments; nothing more is `assumed`."""
+        self.design, self.num_envs, self.layout = design, num_envs, design.states.layout
         self.rho, self.omega = WidthsNow(design.states.rho, num_envs), WidthsNow(design.inputs.rho, num_envs)
         self._delta = WidthsNow(design.states.delta, num_envs)
 
@@ -231,6 +272,11 @@ class FunnelObservers:
     def bound(self, state: PlantState, out: FloatArray) -> Certified:
         """Each observer's own bound [M_i^-1 rho_i]_a, guaranteed while every disagreement is inside its funnel."""
         return Certified(self.design.states.error_bounds(self._delta.at(state.t), out), self.basis)
+
+    def information(self, state: PlantState) -> Information:
+        """Nothing is old here: exchange is continuous."""
+        shape = self.layout.pairs, self.num_envs
+        return Information(*(np.broadcast_to(value, shape) for value in (0.0, 1.0, 0.0)))
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
         """Raise running maxima of |xi| / rho and errors over own bounds, and of the same for inputs, to a state's."""

@@ -252,6 +252,13 @@ class ObserverDesign:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
+    @cached_property
+    def knowledge(self) -> PairLayout:
+        """The pairs (observer, target) up to k hops apart, neighbours included: who knows of whom by messages."""
+        neighborhoods = k_hop_neighbors(self.communication, self.k, relay=False)
+        dimensions = [model.n for model in self.fleet.models]
+        return PairLayout.build(self.links, neighborhoods, dimensions, self.fleet.state_offset, relay=False)
+
     def __str__(self) -> str:
         pairs = f"{self.states.layout.pairs} state and {self.inputs.layout.pairs} input observers"
         return f"{self.fleet}; k={self.k}{'' if self.relay else ', no relays'}, {pairs}"

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from khop_env.observers.base import FunnelObservers, Plant, PlantState
+from khop_env.observers.base import Assumptions, FunnelObservers, Plant, PlantState
 from khop_env.observers.design import Funnels, ObserverDesign
 from khop_env.observers.disagreement import correction, disagreement, largest_curvature
 from khop_env.observers.layout import FloatArray
@@ -88,9 +88,9 @@ class Explicit(FunnelObservers):
     def __repr__(self) -> str:
         return f"Explicit({self._make.__name__})" if isinstance(self._make, type) else "Explicit()"
 
-    def prepare(self, design: ObserverDesign, num_envs: int) -> None:
+    def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
         """Allocate the buffers for steps of `design` in `num_envs` environments."""
-        super().prepare(design, num_envs)
+        super().prepare(design, num_envs, assumed)
         self._derivative = self._make(design, num_envs)
         self._xi, self._mu = (np.zeros((funnels.layout.size, num_envs)) for funnels in (design.states, design.inputs))
 

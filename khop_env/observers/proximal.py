@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from khop_env.elementary import weighted_sum
-from khop_env.observers.base import FunnelObservers, Memory, Plant, PlantState, SolveError
+from khop_env.observers.base import Assumptions, FunnelObservers, Memory, Plant, PlantState, SolveError
 from khop_env.observers.design import Funnels, ObserverDesign
 from khop_env.observers.layout import FloatArray
 from khop_env.observers.prediction import Prediction
@@ -77,9 +77,9 @@ class Proximal(FunnelObservers):
     def __repr__(self) -> str:
         return f"Proximal(order={self.order}, threads={self.threads})"
 
-    def prepare(self, design: ObserverDesign, num_envs: int) -> None:
+    def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
         """Allocate the buffers for steps of `design` in `num_envs` environments."""
-        super().prepare(design, num_envs)
+        super().prepare(design, num_envs, assumed)
         stages = range(len(self._tableau.nodes))
         pairs, input_pairs = design.states.layout.size, design.inputs.layout.size
         self._prediction = Prediction(design, num_envs)

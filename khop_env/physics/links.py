@@ -17,7 +17,7 @@ class Links:
     """The directed links of a communication graph, numbered: sender -> receiver.
 
     An undirected edge is two links. Layouts are built once over all links that may ever be up; which of them are up,
-    and the age of the newest message over each, are data of an episode (`simulation.LinkState`).
+    and the age of the newest message over each, are data of an episode.
 
     Attributes:
         agents: number of agents N.

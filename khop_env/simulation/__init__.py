@@ -3,7 +3,7 @@
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant
 from khop_env.simulation.simulator import Simulator
-from khop_env.simulation.state import LinkState, SimulatorState
+from khop_env.simulation.state import SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, View, ViewBuilder
 
 __all__ = [
@@ -11,7 +11,6 @@ __all__ = [
     "FleetPlant",
     "InitialSet",
     "Law",
-    "LinkState",
     "Observe",
     "Simulator",
     "SimulatorState",

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from khop_env.brief import spread
 from khop_env.observers import (
+    Assumptions,
     Certified,
     Extremes,
     FloatArray,
@@ -28,7 +29,7 @@ from khop_env.observers.disagreement import disagreement
 from khop_env.physics import read_only
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
-from khop_env.simulation.state import LinkState, SimulatorState
+from khop_env.simulation.state import SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
 
 _WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
@@ -82,10 +83,11 @@ class Simulator:
         bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` checks its initial value
         design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         self.observers: Observers = copy.copy(observers or Proximal())  # its buffers are this simulator's own
-        self.observers.prepare(design, num_envs)
         attached = None if disturbance is None else disturbance.attach(self.fleet)
+        pushed = np.zeros(self.fleet.n) if attached is None else attached.bound
+        self.observers.prepare(design, num_envs, Assumptions(initial.center, initial.radius, pushed))
         self.task_graph = nx.empty_graph(len(self.fleet)) if task is None else task
-        views = None if law is None else ViewBuilder(design, self.task_graph, observe, num_envs)
+        views = None if law is None else ViewBuilder(design, self.observers, self.task_graph, observe, num_envs)
         self.plant = FleetPlant(self.fleet, num_envs, attached, law, views)
         self.state = SimulatorState(
             t=np.zeros(num_envs),
@@ -94,14 +96,11 @@ class Simulator:
             g=np.zeros((self.fleet.n, num_envs)),
             drawn=np.zeros((num_envs, 0 if attached is None else attached.draws)),
             memory=self.observers.allocate(),
-            links=LinkState.ideal(design.links, num_envs),
         )
         self._before = self.state.copy()
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
-        reach, pushed = np.abs(initial.center) + initial.radius, np.zeros(self.fleet.n)
-        self._longest_step, self._stiffest = self.fleet.explicit_step(
-            reach, pushed if attached is None else attached.bound
-        )
+        reach = np.abs(initial.center) + initial.radius
+        self._longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
         self.reset(seed=0)
 
     # -- reading -------------------------------------------------------------------------------------------------
@@ -133,7 +132,7 @@ class Simulator:
 
     @property
     def estimates(self) -> FloatArray:
-        """(B, P) state estimates in the order of `design.states.layout`."""
+        """(B, P) state estimates in the order of `observers.layout`."""
         return read_only(self.state.memory["estimate"].T)
 
     @property
@@ -152,7 +151,7 @@ class Simulator:
 
     def errors(self) -> FloatArray:
         """(B, P) estimation errors x_tilde."""
-        return self.estimates - self.x[:, self.design.states.layout.column_source]
+        return self.estimates - self.x[:, self.observers.layout.column_source]
 
     def disagreements(self) -> FloatArray:
         """(B, P) disagreements xi."""

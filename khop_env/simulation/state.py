@@ -8,28 +8,6 @@ import numpy as np
 
 from khop_env.brief import brief
 from khop_env.observers import FloatArray, Memory
-from khop_env.physics import Links
-
-
-@dataclass(frozen=True, eq=False)
-class LinkState:
-    """State of the communication links in B environments: up or down, and the age of the newest message.
-
-    Attributes:
-        weight: (L, B) 1 while a link is up, 0 while it is down, in the order of `ObserverDesign.links`.
-        age: (L, B) of the newest message that was delivered, in s.
-    """
-
-    weight: FloatArray
-    age: FloatArray
-
-    __repr__ = brief
-
-    @staticmethod
-    def ideal(links: Links, num_envs: int) -> LinkState:
-        """All links up, and all messages delivered at once: read-only views of one number each."""
-        shape = len(links), num_envs
-        return LinkState(np.broadcast_to(1.0, shape), np.broadcast_to(0.0, shape))
 
 
 @dataclass(slots=True)
@@ -43,7 +21,6 @@ class SimulatorState:
         g: (n, B) their effect g_i(x_i, u_i).
         drawn: (B, K) the disturbance's random numbers of this episode.
         memory: of the observers, by name.
-        links: state of the communication links.
     """
 
     t: FloatArray
@@ -52,7 +29,6 @@ class SimulatorState:
     g: FloatArray
     drawn: FloatArray
     memory: Memory
-    links: LinkState
 
     __repr__ = brief
 
@@ -64,7 +40,7 @@ class SimulatorState:
         """An independent copy."""
         memory = {name: values.copy() for name, values in self.memory.items()}
         t, x, u, g, drawn = (array.copy() for array in (self.t, self.x, self.u, self.g, self.drawn))
-        return SimulatorState(t, x, u, g, drawn, memory, self.links)
+        return SimulatorState(t, x, u, g, drawn, memory)
 
     def copy_step(self, other: SimulatorState) -> None:
         """Copy the arrays that a step changes into `other`, of the same shapes: all but the episode's draws."""

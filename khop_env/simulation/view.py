@@ -10,7 +10,7 @@ import numpy as np
 
 from khop_env.brief import brief
 from khop_env.compiled import compiled
-from khop_env.observers import FloatArray, IntArray, ObserverDesign
+from khop_env.observers import FloatArray, IntArray, ObserverDesign, Observers
 from khop_env.physics import Fleet, read_only
 
 Observe = Literal["estimate", "oracle", "local"]
@@ -60,13 +60,16 @@ class ViewBuilder:
     """Fills a `View` from the simulator's states and estimates.
 
     Args:
-        design: the observers.
+        design: who sends to whom.
+        observers: their layout has a place for every estimate.
         task: the task graph on the same nodes.
         observe: source of the states of k-hop targets: their "estimate", the true states ("oracle"), or none ("local").
         num_envs: number of environments.
     """
 
-    def __init__(self, design: ObserverDesign, task: nx.Graph, observe: Observe, num_envs: int) -> None:
+    def __init__(
+        self, design: ObserverDesign, observers: Observers, task: nx.Graph, observe: Observe, num_envs: int
+    ) -> None:
         fleet = design.fleet
         edges = np.array(sorted([*task.edges, *((j, i) for i, j in task.edges)]), np.int64).reshape(-1, 2)
         position, offset = fleet.position_index, fleet.state_offset
@@ -74,11 +77,12 @@ class ViewBuilder:
         self._other = np.ascontiguousarray(position[edges[:, 1]])
         self._kind = np.zeros(len(edges), np.int64)
         for number, (i, j) in enumerate(edges.tolist()):
-            if (j, i) in design.links.index or observe == "oracle":
+            neighbor = (j, i) in design.links.index
+            if observe == "oracle" or (neighbor and not observers.by_messages):
                 continue
-            if observe == "estimate":
+            if observe == "estimate" or neighbor:
                 self._kind[number] = 1
-                self._other[number] += design.states.layout.slot[i, j] - offset[j]
+                self._other[number] += observers.layout.slot[i, j] - offset[j]
             else:
                 self._kind[number] = 2
         self._columns = np.zeros((len(edges), fleet.position_dim, num_envs))

@@ -29,7 +29,7 @@ def environment(state: SimulatorState, b: int) -> SimulatorState:
     """Environment b of a batch as a state of its own."""
     memory = {name: values[:, b : b + 1] for name, values in state.memory.items()}
     parts = {name: getattr(state, name)[..., b : b + 1] for name in ("t", "x", "u", "g")}
-    return SimulatorState(**parts, drawn=state.drawn[b : b + 1], memory=memory, links=state.links)
+    return SimulatorState(**parts, drawn=state.drawn[b : b + 1], memory=memory)
 
 
 def steps(integrator: str) -> tuple[float, int]:
