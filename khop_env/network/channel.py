@@ -50,7 +50,7 @@ class Channel:
             bad: (L, B) whether a link is in the state in which it loses messages.
             lost: (words, L, B) a bit for each of the last rounds, whether its message was lost.
             newest: (L, B) round in which the newest message that has arrived was sent, -1 for none yet.
-            heard: (L, B) whether that changed in the last round.
+            heard: (L, B) whether that changed in the last call of `begin_round`.
             sent: (rounds, W, B) what was sent in the last rounds; a round's place is its number modulo their count.
         """
         shape, late = (len(self.links), self.num_envs), self.rules.most_rounds_late
@@ -96,21 +96,49 @@ class Channel:
         Args:
             memory: of the channel; changed.
             values: (W, B) what agents send.
+            up: as for `begin_round`.
+            due: as for `begin_round`.
+
+        Raises:
+            ValueError: for an array of a wrong shape.
+        """
+        if np.shape(values) != memory["sent"].shape[1:]:
+            raise ValueError(
+                f"values (width, environments) have shape {np.shape(values)}; expected {memory['sent'].shape[1:]}"
+            )
+        self.begin_round(memory, up, due)
+        self.send(memory, [values], due)
+
+    def begin_round(
+        self, memory: ChannelMemory, up: NDArray[np.bool_] | None = None, due: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Decide what is lost of the messages of a new round, and what arrives now; `send` has to follow.
+
+        Args:
+            memory: of the channel; changed.
             up: (L, B) links that are up now; a message sent over one that is down is lost. None for all.
-            due: (B,) environments in which there is a round now; the others keep every bit. None for all.
+            due: (B,) environments in which there is a round now; in the others nothing happens. None for all.
 
         Raises:
             ValueError: for an array of a wrong shape.
         """
         up = self._array(up, self._all_up, "up (links, environments)")
         due = self._array(due, self._all_due, "due (environments,)")
-        if np.shape(values) != memory["sent"].shape[1:]:
-            raise ValueError(
-                f"values (width, environments) have shape {np.shape(values)}; expected {memory['sent'].shape[1:]}"
-            )
         state = (memory[name] for name in ("bad", "lost", "newest", "heard"))
         run_round(self.rules, memory["key"], memory["round"], due, up, *state)
-        send(values, memory["round"], due, memory["sent"])
+
+    def send(self, memory: ChannelMemory, parts: Sequence[FloatArray], due: NDArray[np.bool_] | None = None) -> None:
+        """Send the messages of the round that has begun.
+
+        Args:
+            memory: of the channel; changed.
+            parts: rows of what all agents send, (rows, B) each, W rows in all.
+            due: as for `begin_round`.
+        """
+        due, first = self._array(due, self._all_due, "due (environments,)"), 0
+        for part in parts:
+            send(part, first, memory["round"], due, memory["sent"])
+            first += len(part)
 
     def receive(self, memory: ChannelMemory, link: IndexArray, row: IndexArray, held: FloatArray) -> None:
         """Copy what is new since the round before; what nothing new came for keeps its last value.

@@ -126,6 +126,11 @@ class Network:
         """Rounds until the latest message can be used."""
         return self.rounds_late(self.bounds("latency")[1] + self.jitter)
 
+    @property
+    def fewest_rounds_late(self) -> int:
+        """Rounds until the earliest message can be used."""
+        return self.rounds_late(self.bounds("latency")[0] - self.jitter)
+
     def described(self) -> str:
         """One line: "a message every 50 ms, 30 % lost in bursts of 5, 30 +- 5 ms late"."""
         low, high = (100.0 * value for value in self.bounds("loss"))

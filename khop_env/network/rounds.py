@@ -83,6 +83,7 @@ def run_round(
         of_round[b] = round_key(key[b], number[b])
     for link in range(links):
         for b in range(batch):
+            heard[link, b] = False
             if not due[b]:
                 continue
             now = number[b]
@@ -93,7 +94,6 @@ def run_round(
                 lost[word, link, b] |= bit
             else:
                 lost[word, link, b] &= ~bit
-            heard[link, b] = False
             soonest = _rounds_late(rules, latency[b], 0.0)
             latest = _rounds_late(rules, latency[b], 1.0)
             for age in range(soonest, min(latest, now - newest[link, b] - 1) + 1):
@@ -109,13 +109,13 @@ def run_round(
 
 
 @compiled
-def send(values: FloatArray, number: NDArray[np.int64], due: NDArray[np.bool_], sent: FloatArray) -> None:
-    """Keep what agents send (W, B) in this round's place of the ring (rounds, W, B)."""
+def send(values: FloatArray, first: int, number: NDArray[np.int64], due: NDArray[np.bool_], sent: FloatArray) -> None:
+    """Keep what agents send in this round's place of the ring (rounds, W, B), as its rows from `first` on."""
     place = number % sent.shape[0]
     for row in range(values.shape[0]):
         for b in range(values.shape[1]):
             if due[b]:
-                sent[place[b], row, b] = values[row, b]
+                sent[place[b], first + row, b] = values[row, b]
 
 
 @compiled

@@ -27,13 +27,16 @@ from khop_env.observers.design import (
     ObserverDesign,
     TargetObservers,
 )
+from khop_env.observers.estimators import ESTIMATORS, Estimator, Relay
 from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
 from khop_env.observers.messages import MessagePassing
+from khop_env.observers.networked import Networked
 from khop_env.observers.performance import Exponential, FunnelBank, PerformanceFunction, lower_bound
 from khop_env.observers.proximal import Proximal
 
 __all__ = [
+    "ESTIMATORS",
     "Assumptions",
     "BatchedRightHandSide",
     "Bound",
@@ -43,6 +46,7 @@ __all__ = [
     "Derivative",
     "DesignError",
     "DesignRule",
+    "Estimator",
     "Explicit",
     "Exponential",
     "Extremes",
@@ -55,6 +59,7 @@ __all__ = [
     "IntArray",
     "Memory",
     "MessagePassing",
+    "Networked",
     "ObserverDesign",
     "Observers",
     "PairArrays",
@@ -64,6 +69,7 @@ __all__ = [
     "PlantState",
     "Prediction",
     "Proximal",
+    "Relay",
     "RightHandSide",
     "SolveError",
     "TargetBlock",

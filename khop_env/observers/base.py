@@ -7,6 +7,7 @@ together with it, stage by stage.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -73,6 +74,10 @@ class Plant(Protocol):
         """
         ...
 
+    def effect(self, state: PlantState) -> None:
+        """Write the effect g_i(x_i, u_i) of the inputs in force into `state.g`."""
+        ...
+
     def actuate(self, state: PlantState) -> None:
         """Write the law's inputs at t, x and the estimates into `state.u`, and their effect into `state.g`."""
         ...
@@ -126,6 +131,7 @@ class Observers(Protocol):
         name: e.g. "proximal".
         order: of convergence in the step.
         by_messages: whether agents know of others, neighbours included, by messages only, which can be lost or late.
+        longest_step: longest step in s; simulators divide longer ones.
         layout: of the pairs (observer, target) that "estimate" is about, once prepared. Neighbours are among the
             targets where `by_messages`.
     """
@@ -133,6 +139,7 @@ class Observers(Protocol):
     name: str
     order: int
     by_messages: bool
+    longest_step: float
     layout: PairLayout
 
     def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
@@ -150,12 +157,13 @@ class Observers(Protocol):
         ...
 
     def reset(
-        self, memory: Memory, env_ids: IntArray, rngs: Sequence[np.random.Generator], first_guess: FloatArray
+        self, state: PlantState, env_ids: IntArray, rngs: Sequence[np.random.Generator], first_guess: FloatArray
     ) -> None:
         """Start anew in some environments.
 
         Args:
-            memory: of all environments; the others keep every bit.
+            state: of all environments, with the first states of those that are reset, and u = 0; the others keep every
+                bit of their memory.
             env_ids: (R,) their indices.
             rngs: (R,) generators, for realisations that draw random numbers; drawing from them directly changes later
                 draws of the episode, so use `rng.spawn(1)`.
@@ -249,6 +257,7 @@ class FunnelObservers:
 
     basis: Basis = "theorem"
     by_messages = False
+    longest_step = math.inf
 
     def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
         """Allocate the buffers for steps of `design` in `num_envs` environments; nothing more is `assumed`."""
@@ -262,10 +271,10 @@ class FunnelObservers:
         return {name: np.zeros((size, self.num_envs)) for name, size in sizes.items()}
 
     def reset(
-        self, memory: Memory, env_ids: IntArray, rngs: Sequence[np.random.Generator], first_guess: FloatArray
+        self, state: PlantState, env_ids: IntArray, rngs: Sequence[np.random.Generator], first_guess: FloatArray
     ) -> None:
-        """Start the estimates in `memory` from `first_guess` in the environments `env_ids`; `rngs` aren't used."""
-        for name, values in memory.items():
+        """Start the estimates from `first_guess` in the environments `env_ids`; `rngs` aren't used."""
+        for name, values in state.memory.items():
             guess = first_guess[self.design.states.layout.column_source][:, None] if name == "estimate" else 0.0
             values[:, env_ids] = guess
 

@@ -10,7 +10,7 @@ import numpy as np
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.physics import AgentModel, Growth
 
-_STEP = 1.0 / 32.0  # s, for models that don't say
+LONGEST_STEP = 1.0 / 32.0  # s, for models that don't say
 _MOST_STEPS = 100_000
 
 
@@ -47,7 +47,7 @@ def predict(
         ValueError: for an age that is negative, not finite, or takes more than 100 000 steps.
     """
     age = np.asarray(age, np.float64)
-    longest = _STEP if growth is None else growth.step
+    longest = LONGEST_STEP if growth is None else growth.step
     if not ((age >= 0.0) & (age <= _MOST_STEPS * min(longest, 1e9))).all():
         raise ValueError(
             f"ages must be from 0 to {_MOST_STEPS * min(longest, 1e9):g} s for {model.__class__.__name__}, whose drift "

@@ -248,6 +248,11 @@ class PairLayout:
         return _joined(np.repeat(np.arange(b.pairs.start, b.pairs.stop), b.components) for b in self.blocks)
 
     @cached_property
+    def pair_target(self) -> IntArray:
+        """(pairs,) the agent that each pair's observer estimates."""
+        return np.repeat(self.target, self.arrays.observers)
+
+    @cached_property
     def row_source(self) -> IntArray:
         """(rows,) index into the fleet's flat vector of each row's true component."""
         return _joined(np.arange(b.sources.start, b.sources.stop) for b in self.blocks)

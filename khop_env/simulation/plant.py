@@ -29,13 +29,21 @@ class FleetPlant:
         disturbance: an attached disturbance (`physics.Disturbance.attach`), or None.
         law: the feedback law, or None for inputs that are held.
         views: builds the law's view; needed with a law.
+        saturated: whether a law's inputs are kept within the models' limits.
     """
 
     def __init__(
-        self, fleet: Fleet, num_envs: int, disturbance: Any | None, law: Law | None, views: ViewBuilder | None
+        self,
+        fleet: Fleet,
+        num_envs: int,
+        disturbance: Any | None,
+        law: Law | None,
+        views: ViewBuilder | None,
+        saturated: bool = False,
     ) -> None:
         self.fleet, self.num_envs = fleet, num_envs
         self.disturbance, self.law, self.views = disturbance, law, views
+        self._limit = fleet.input_limit[:, None] if saturated else None
         self._rates: tuple[FloatArray, ...] = ()
         self._states = self._inputs = self._effects = self._drawn = np.zeros((0, 0))
         self._t = np.zeros(0)
@@ -78,7 +86,13 @@ class FleetPlant:
                     f"{(self.num_envs, self.fleet.m)}"
                 )
             state.u.T[:] = u
+            if self._limit is not None:
+                np.clip(state.u, -self._limit, self._limit, out=state.u)
         self.fleet.input_map(self._t, states, self._inputs, self._effects)
+
+    def effect(self, state: PlantState) -> None:
+        """Write g(x, u) of the inputs in force."""
+        self.fleet.input_map(self._t, self._bind(state), self._inputs, self._effects)
 
     def _bind(self, state: PlantState) -> FloatArray:
         """The states (B, n) as models see them; read-only views are made once, and again for another state's arrays."""
@@ -105,20 +119,20 @@ def require_finite(x: FloatArray, fleet: Fleet) -> None:
         )
 
 
-def parts_of_step(dt: float, longest: float, agent: str) -> int:
-    """Number of equal parts into which a step is divided, so that the plant's drift is stable in each of them.
+def parts_of_step(dt: float, longest: float, reason: str) -> int:
+    """Number of equal parts into which a step is divided.
 
     Args:
         dt: step in s.
-        longest: longest step for which the drift is stable (`Fleet.explicit_step`), in s.
-        agent: id of the agent with this drift, for the error.
+        longest: longest step in s.
+        reason: what doesn't take longer ones, for the error.
 
     Raises:
         ValueError: for more than `MOST_PARTS`.
     """
     if dt > MOST_PARTS * longest:
         raise ValueError(
-            f"dt = {dt:g} s is too long: the drift of {agent!r} takes {longest:.3g} s at a time, and no step is "
+            f"dt = {dt:g} s is too long: {reason} takes {longest:.3g} s at a time, and no step is "
             f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
         )
     return max(1, math.ceil(dt / longest))

@@ -88,7 +88,7 @@ class Simulator:
         self.observers.prepare(design, num_envs, Assumptions(initial.center, initial.radius, pushed))
         self.task_graph = nx.empty_graph(len(self.fleet)) if task is None else task
         views = None if law is None else ViewBuilder(design, self.observers, self.task_graph, observe, num_envs)
-        self.plant = FleetPlant(self.fleet, num_envs, attached, law, views)
+        self.plant = FleetPlant(self.fleet, num_envs, attached, law, views, saturated=self.observers.by_messages)
         self.state = SimulatorState(
             t=np.zeros(num_envs),
             x=np.zeros((self.fleet.n, num_envs)),
@@ -201,7 +201,8 @@ class Simulator:
             state.x[:, chosen] = np.broadcast_to(start, (len(chosen), self.fleet.n)).T
         for zeros in (state.t, state.u, *self.running_extremes):
             zeros[..., chosen] = 0.0
-        self.observers.reset(state.memory, chosen, generators, self.initial.center)
+        self.plant.effect(state)
+        self.observers.reset(state, chosen, generators, self.initial.center)
         self.plant.actuate(state)
         self.observers.raise_extremes(state, self.running_extremes)
         if not np.all(self.running_extremes.input_normalized[chosen] < 1.0):
@@ -247,7 +248,8 @@ class Simulator:
         Raises:
             ValueError: for more than `MOST_PARTS`.
         """
-        return parts_of_step(dt, self._longest_step, self.fleet.ids[self._stiffest])
+        parts = parts_of_step(dt, self._longest_step, f"the drift of {self.fleet.ids[self._stiffest]!r}")
+        return max(parts, parts_of_step(dt, self.observers.longest_step, "the period of messages"))
 
     def advance(self, dt: float, parts: int) -> None:
         """`step` with the inputs in force, without checks: for callers that have checked the step.

@@ -1,0 +1,127 @@
+"""Estimators over a network: what an agent makes of the messages that it gets."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.network import Network
+from khop_env.observers.base import Extremes, Memory, PlantState
+from khop_env.observers.design import ObserverDesign
+from khop_env.observers.layout import FloatArray, IntArray
+from khop_env.physics import did_you_mean
+
+Take: TypeAlias = Callable[[IntArray, IntArray, FloatArray], None]
+"""take(link (C,), row (C,), held (C, B)): copy into `held` what has just come over links, from rows of what is sent."""
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """How estimates are made of messages; one class is all that an estimator of your own needs.
+
+    `Networked` stores and forwards stamped states anyway, predicts them, and clips every estimate into the box that
+    they certify. So an estimator only says what more is sent, and which estimates it proposes.
+
+    Attributes:
+        name: e.g. "relay".
+        width: rows that it adds to what all agents send in a round; once prepared.
+        proposal: (pairs,) of `design.knowledge`: first row of each pair's estimate in the memory called `proposed`, or
+            -1 to take the box's centre.
+        proposed: name of that memory; "" for none.
+    """
+
+    name: str
+    width: int
+    proposal: IntArray
+    proposed: str
+
+    def prepare(self, design: ObserverDesign, network: Network, num_envs: int, first_row: int) -> None:
+        """Get ready.
+
+        Args:
+            design: the pairs and funnels.
+            network: how often there is a round, and what becomes of messages.
+            num_envs: number of environments B.
+            first_row: the row at which its own part of what is sent begins. Before it come the message's time, the
+                fleet's states (n), and the predictions (P), stamps and hops (pairs each) of `design.knowledge`.
+        """
+        ...
+
+    def allocate(self) -> Memory:
+        """Its own memory, zeroed, by names that nobody else uses."""
+        ...
+
+    def reset(self, memory: Memory, env_ids: IntArray, first_guess: FloatArray) -> None:
+        """Start anew in the environments `env_ids`, from the `first_guess` (n,) of the fleet's states."""
+        ...
+
+    def predict(self, memory: Memory, t: FloatArray, dt: float) -> None:
+        """Move its estimates from the times `t` (B,) by `dt` seconds, without messages."""
+        ...
+
+    def message(self, state: PlantState) -> list[FloatArray]:
+        """Its own part of what all agents send now: arrays (rows, B), `width` rows in all."""
+        ...
+
+    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_]) -> None:
+        """Use the messages of a round, in the environments that are `due` (B,); the others keep every bit."""
+        ...
+
+    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+        """Raise running maxima of ratios that it guarantees; may do nothing."""
+        ...
+
+
+class Relay:
+    """States are passed on with their stamps and predicted by the model: the estimate is the certified box's centre."""
+
+    name = "relay"
+    proposed = ""
+    width = 0
+
+    def prepare(self, design: ObserverDesign, network: Network, num_envs: int, first_row: int) -> None:
+        """Get ready for the pairs of `design`; the `network`, `num_envs` and `first_row` don't matter."""
+        self.proposal = np.full(design.knowledge.pairs, -1)
+
+    def allocate(self) -> Memory:
+        """No memory."""
+        return {}
+
+    def reset(self, memory: Memory, env_ids: IntArray, first_guess: FloatArray) -> None:
+        """Nothing to do."""
+
+    def predict(self, memory: Memory, t: FloatArray, dt: float) -> None:
+        """Nothing to do."""
+
+    def message(self, state: PlantState) -> list[FloatArray]:
+        """Nothing more."""
+        return []
+
+    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_]) -> None:
+        """Nothing to do."""
+
+    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+        """No ratios."""
+
+
+ESTIMATORS: Mapping[str, type[Estimator]] = {"relay": Relay}
+
+
+def as_estimator(estimator: str | Estimator) -> Estimator:
+    """An estimator by name, or a copy of an object.
+
+    Raises:
+        ValueError: for an unknown name, or an object that isn't an estimator.
+    """
+    if isinstance(estimator, str):
+        if estimator not in ESTIMATORS:
+            raise ValueError(f"no estimator {estimator!r}; {did_you_mean(estimator, ESTIMATORS)}")
+        return ESTIMATORS[estimator]()
+    missing = [name for name in ("name", "prepare", "message", "receive") if not hasattr(estimator, name)]
+    if missing:
+        raise ValueError(f"an estimator is a name ({', '.join(ESTIMATORS)}) or an Estimator; got {estimator!r}")
+    return copy.copy(estimator)

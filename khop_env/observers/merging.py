@@ -1,0 +1,147 @@
+"""Store and forward: of every agent the freshest state that has come along any way, in compiled code."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.compiled import compiled
+from khop_env.observers.layout import FloatArray, IntArray, PairLayout
+
+TIME = 0  # row of a message's time
+
+
+class Sources(NamedTuple):
+    """Where each pair (observer, target) may hear of its target: from the target, or from another that knows it.
+
+    Attributes:
+        start: (pairs + 1,) where each pair's part of the other arrays begins; ordered by sender.
+        link: over which it comes.
+        state: first row of the target's state in what all agents send.
+        stamp: row of its stamp: that of the message's time where the target itself sends.
+        hops: row of the number of links that it has come already; -1 for the target itself.
+        column: (pairs,) first column of the pair's prediction.
+        components: (pairs,) of its state.
+    """
+
+    start: IntArray
+    link: IntArray
+    state: IntArray
+    stamp: IntArray
+    hops: IntArray
+    column: IntArray
+    components: IntArray
+
+    @staticmethod
+    def of(layout: PairLayout, agents: int) -> Sources:
+        """The sources of a layout of all agents within k hops.
+
+        What is sent has these rows: the message's time; the states of all `agents` components of the fleet; the
+        predictions (P) and then the stamps and the hops (pairs each) of all pairs.
+        """
+        arrays, sender = layout.arrays, layout.links.sender
+        start, found = [0], list[tuple[int, int, int, int]]()
+        column, components = [], []
+        for block in layout.blocks:
+            for place, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
+                ways = [
+                    (link, 1 + block.sources.start, TIME, -1)
+                    for link in layout.relay_link[layout.relay_start[pair] : layout.relay_start[pair + 1]].tolist()
+                ]
+                part = slice(arrays.entry_start[pair], arrays.entry_start[pair + 1])
+                for other, link in zip(arrays.entry[part].tolist(), layout.entry_link[part].tolist(), strict=True):
+                    state = 1 + agents + block.columns.start + other * block.components
+                    stamp = 1 + agents + layout.size + block.pairs.start + other
+                    ways.append((link, state, stamp, stamp + layout.pairs))
+                found += sorted(ways, key=lambda way: int(sender[way[0]]))
+                start.append(len(found))
+                column.append(block.columns.start + place * block.components)
+                components.append(block.components)
+        columns = np.array(found, np.int64).reshape(-1, 4).T.copy()
+        link, state, stamps, hops = columns
+        return Sources(
+            np.array(start), link, state, stamps, hops, np.array(column, np.int64), np.array(components, np.int64)
+        )
+
+
+@compiled
+def merge(
+    sources: Sources,
+    late: bool,
+    sent: FloatArray,
+    number: NDArray[np.int64],
+    newest: NDArray[np.int64],
+    heard: NDArray[np.bool_],
+    t: FloatArray,
+    center: FloatArray,
+    stamp: FloatArray,
+    hops: FloatArray,
+    arrived: FloatArray,
+    lag: FloatArray,
+) -> bool:
+    """Take over what is fresher than what is held, from the messages that have just arrived.
+
+    Args:
+        sources: as a plain tuple.
+        late: True for messages of earlier rounds, False for those of this one.
+        sent: (rounds, W, B) what was sent.
+        number: (B,) this round.
+        newest: (L, B) round in which each link's newest message was sent.
+        heard: (L, B) whether it has just arrived.
+        t: (B,) now, in s.
+        center: (P, B) predictions; changed.
+        stamp: (pairs, B) when the state behind each was measured, -1 for none; changed.
+        hops: (pairs, B) links over which it came; changed.
+        arrived: (pairs, B) when; changed.
+        lag: (pairs, B) age of the message that was taken over, else 0; written.
+
+    Returns:
+        Whether any message that was taken over is of an earlier time.
+    """
+    start, link, state, stamp_row, hops_row, column, components = sources
+    capacity, batch = sent.shape[0], t.size
+    choice, place = np.empty(batch, np.int64), np.empty(batch, np.int64)
+    behind = False
+    for pair in range(column.size):
+        for b in range(batch):
+            choice[b] = -1
+            lag[pair, b] = 0.0
+        found = False
+        for way in range(start[pair], start[pair + 1]):
+            over, row = link[way], stamp_row[way]
+            for b in range(batch):
+                if heard[over, b] and (newest[over, b] < number[b]) == late:
+                    at = newest[over, b] % capacity
+                    if sent[at, row, b] > stamp[pair, b]:
+                        stamp[pair, b] = sent[at, row, b]
+                        choice[b], place[b] = way, at
+                        found = True
+        if not found:
+            continue
+        for b in range(batch):
+            way = choice[b]
+            if way < 0:
+                continue
+            at = place[b]
+            for c in range(components[pair]):
+                center[column[pair] + c, b] = sent[at, state[way] + c, b]
+            hops[pair, b] = 1.0 if hops_row[way] < 0 else sent[at, hops_row[way], b] + 1.0
+            arrived[pair, b] = t[b]
+            lag[pair, b] = t[b] - sent[at, TIME, b]
+            behind = behind or lag[pair, b] > 0.0
+    return behind
+
+
+@compiled
+def largest_share(
+    column_source: IntArray, estimate: FloatArray, x: FloatArray, bound: FloatArray, largest: FloatArray
+) -> None:
+    """Raise `largest` (B,) to the largest |error| / bound of any estimate (P, B); 0 / 0 counts as 0."""
+    for q in range(column_source.size):
+        row = column_source[q]
+        for b in range(largest.size):
+            error = abs(estimate[q, b] - x[row, b])
+            if not error <= largest[b] * bound[q, b]:  # a NaN is reported as such
+                largest[b] = error / bound[q, b]
