@@ -137,8 +137,12 @@ def take_heard(
     out: FloatArray,
 ) -> None:
     """Copy into `out` (C, B) what came over links in this round, and leave the rest."""
-    capacity = sent.shape[0]
+    place = np.empty(newest.shape, np.int64)  # in the ring, -1 where nothing is new
+    for over in range(newest.shape[0]):
+        for b in range(newest.shape[1]):
+            place[over, b] = newest[over, b] % sent.shape[0] if heard[over, b] else -1
     for c in range(len(link)):
         for b in range(out.shape[1]):
-            if heard[link[c], b]:
-                out[c, b] = sent[newest[link[c], b] % capacity, row[c], b]
+            at = place[link[c], b]
+            if at >= 0:
+                out[c, b] = sent[at, row[c], b]

@@ -27,13 +27,14 @@ from khop_env.observers.design import (
     ObserverDesign,
     TargetObservers,
 )
-from khop_env.observers.estimators import ESTIMATORS, Estimator, Relay
+from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
 from khop_env.observers.messages import MessagePassing
-from khop_env.observers.networked import Networked
+from khop_env.observers.networked import ESTIMATORS, Networked, as_estimator
 from khop_env.observers.performance import Exponential, FunnelBank, PerformanceFunction, lower_bound
 from khop_env.observers.proximal import Proximal
+from khop_env.observers.rounds import Rounds
 
 __all__ = [
     "ESTIMATORS",
@@ -71,9 +72,11 @@ __all__ = [
     "Proximal",
     "Relay",
     "RightHandSide",
+    "Rounds",
     "SolveError",
     "TargetBlock",
     "TargetObservers",
+    "as_estimator",
     "lower_bound",
     "predict",
 ]

@@ -131,6 +131,7 @@ class Observers(Protocol):
         name: e.g. "proximal".
         order: of convergence in the step.
         by_messages: whether agents know of others, neighbours included, by messages only, which can be lost or late.
+        copied: whether `advance` gets a copy of the memory as it was; it may change nothing before it raises otherwise.
         longest_step: longest step in s; simulators divide longer ones.
         layout: of the pairs (observer, target) that "estimate" is about, once prepared. Neighbours are among the
             targets where `by_messages`.
@@ -139,6 +140,7 @@ class Observers(Protocol):
     name: str
     order: int
     by_messages: bool
+    copied: bool
     longest_step: float
     layout: PairLayout
 
@@ -257,6 +259,7 @@ class FunnelObservers:
 
     basis: Basis = "theorem"
     by_messages = False
+    copied = True
     longest_step = math.inf
 
     def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:

@@ -11,15 +11,13 @@ Theory and proofs: docs/theory_certificates.md.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from khop_env.observers.boxes import Box
 from khop_env.observers.dead_reckoning import predict
 from khop_env.observers.layout import FloatArray
-from khop_env.observers.radius import KNOTS, OCTAVES, RadiusTable
+from khop_env.observers.radius import RadiusTable
 from khop_env.physics import AgentModel, Growth
 
 _PROBES = 256
@@ -39,6 +37,7 @@ class Certificate:
 
     Attributes:
         growth: as the model declares it, None if it doesn't.
+        rate: (n,) bound on |g| + |w|, in state units per second.
         reason: why nothing is certified; "" for a certificate that bounds every component.
 
     Raises:
@@ -57,7 +56,7 @@ class Certificate:
         self.region = np.full(n, math.inf) if region is None else _bounds(region, n, "region")
         self.start, disturbance = _bounds(start, n, "start"), _bounds(disturbance, n, "disturbance")
         self.growth = model.drift_growth(self.region)
-        rate = model.checked_input_map_bound() + disturbance
+        self.rate = rate = model.checked_input_map_bound() + disturbance
         self.reason = _reason(model, self.growth, rate, self.start)
         self._table = None
         if self.growth is not None:
@@ -88,15 +87,6 @@ class Certificate:
         if self._table is None:
             return np.full((self.model.n, *age.shape), math.inf)
         return self._table.at(age)
-
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """What `radius` reads, for compiled loops; the region last."""
-        if self._table is None:
-            n, knots = self.model.n, KNOTS * (OCTAVES + 1)
-            nothing, all_of_it = np.full(n, math.inf), np.ones(n, np.bool_)
-            values = np.full((n, knots + 1), math.inf)
-            return values, values[:, 1:], nothing, nothing, all_of_it, self.region
-        return (*self._table.arrays(), self.region)
 
     def box(self, x: FloatArray, age: FloatArray, t: FloatArray | float = 0.0) -> Box:
         """Where the state is for certain.

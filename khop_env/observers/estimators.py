@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -13,7 +12,6 @@ from khop_env.network import Network
 from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.layout import FloatArray, IntArray
-from khop_env.physics import did_you_mean
 
 Take: TypeAlias = Callable[[IntArray, IntArray, FloatArray], None]
 """take(link (C,), row (C,), held (C, B)): copy into `held` what has just come over links, from rows of what is sent."""
@@ -106,22 +104,3 @@ class Relay:
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
         """No ratios."""
-
-
-ESTIMATORS: Mapping[str, type[Estimator]] = {"relay": Relay}
-
-
-def as_estimator(estimator: str | Estimator) -> Estimator:
-    """An estimator by name, or a copy of an object.
-
-    Raises:
-        ValueError: for an unknown name, or an object that isn't an estimator.
-    """
-    if isinstance(estimator, str):
-        if estimator not in ESTIMATORS:
-            raise ValueError(f"no estimator {estimator!r}; {did_you_mean(estimator, ESTIMATORS)}")
-        return ESTIMATORS[estimator]()
-    missing = [name for name in ("name", "prepare", "message", "receive") if not hasattr(estimator, name)]
-    if missing:
-        raise ValueError(f"an estimator is a name ({', '.join(ESTIMATORS)}) or an Estimator; got {estimator!r}")
-    return copy.copy(estimator)

@@ -22,6 +22,7 @@ class Sources(NamedTuple):
         state: first row of the target's state in what all agents send.
         stamp: row of its stamp: that of the message's time where the target itself sends.
         hops: row of the number of links that it has come already; -1 for the target itself.
+        error: first row of its certified error; -1 for the target itself.
         column: (pairs,) first column of the pair's prediction.
         components: (pairs,) of its state.
     """
@@ -31,6 +32,7 @@ class Sources(NamedTuple):
     state: IntArray
     stamp: IntArray
     hops: IntArray
+    error: IntArray
     column: IntArray
     components: IntArray
 
@@ -39,31 +41,29 @@ class Sources(NamedTuple):
         """The sources of a layout of all agents within k hops.
 
         What is sent has these rows: the message's time; the states of all `agents` components of the fleet; the
-        predictions (P) and then the stamps and the hops (pairs each) of all pairs.
+        predictions and their certified errors (P each) and then the stamps and the hops (pairs each) of all pairs.
         """
         arrays, sender = layout.arrays, layout.links.sender
-        start, found = [0], list[tuple[int, int, int, int]]()
+        start, found = [0], list[tuple[int, int, int, int, int]]()
         column, components = [], []
         for block in layout.blocks:
             for place, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
                 ways = [
-                    (link, 1 + block.sources.start, TIME, -1)
+                    (link, 1 + block.sources.start, TIME, -1, -1)
                     for link in layout.relay_link[layout.relay_start[pair] : layout.relay_start[pair + 1]].tolist()
                 ]
                 part = slice(arrays.entry_start[pair], arrays.entry_start[pair + 1])
                 for other, link in zip(arrays.entry[part].tolist(), layout.entry_link[part].tolist(), strict=True):
                     state = 1 + agents + block.columns.start + other * block.components
-                    stamp = 1 + agents + layout.size + block.pairs.start + other
-                    ways.append((link, state, stamp, stamp + layout.pairs))
+                    stamp = 1 + agents + 2 * layout.size + block.pairs.start + other
+                    ways.append((link, state, stamp, stamp + layout.pairs, state + layout.size))
                 found += sorted(ways, key=lambda way: int(sender[way[0]]))
                 start.append(len(found))
                 column.append(block.columns.start + place * block.components)
                 components.append(block.components)
-        columns = np.array(found, np.int64).reshape(-1, 4).T.copy()
-        link, state, stamps, hops = columns
-        return Sources(
-            np.array(start), link, state, stamps, hops, np.array(column, np.int64), np.array(components, np.int64)
-        )
+        link, state, stamps, hops, errors = np.array(found, np.int64).reshape(-1, 5).T.copy()
+        first, places, sizes = (np.array(values, np.int64) for values in (start, column, components))
+        return Sources(first, link, state, stamps, hops, errors, places, sizes)
 
 
 @compiled
@@ -74,8 +74,11 @@ def merge(
     number: NDArray[np.int64],
     newest: NDArray[np.int64],
     heard: NDArray[np.bool_],
+    noise: float,
     t: FloatArray,
+    now: FloatArray,
     center: FloatArray,
+    error: FloatArray,
     stamp: FloatArray,
     hops: FloatArray,
     arrived: FloatArray,
@@ -90,19 +93,27 @@ def merge(
         number: (B,) this round.
         newest: (L, B) round in which each link's newest message was sent.
         heard: (L, B) whether it has just arrived.
-        t: (B,) now, in s.
+        noise: certified error of a state that its agent itself sends.
+        t: (B,) time that predictions are of, in s.
+        now: (B,) the round's time, in s.
         center: (P, B) predictions; changed.
+        error: (P, B) their certified errors; changed.
         stamp: (pairs, B) when the state behind each was measured, -1 for none; changed.
         hops: (pairs, B) links over which it came; changed.
         arrived: (pairs, B) when; changed.
-        lag: (pairs, B) age of the message that was taken over, else 0; written.
+        lag: (pairs, B) time from the message that was taken over to `t`, in s, else 0; written.
 
     Returns:
-        Whether any message that was taken over is of an earlier time.
+        Whether any of these is positive.
     """
-    start, link, state, stamp_row, hops_row, column, components = sources
+    start, link, state, stamp_row, hops_row, error_row, column, components = sources
     capacity, batch = sent.shape[0], t.size
-    choice, place = np.empty(batch, np.int64), np.empty(batch, np.int64)
+    choice = np.empty(batch, np.int64)
+    place = np.empty(newest.shape, np.int64)  # in the ring, -1 where nothing is to be read
+    for over in range(newest.shape[0]):
+        for b in range(batch):
+            arrives = heard[over, b] and (newest[over, b] < number[b]) == late
+            place[over, b] = newest[over, b] % capacity if arrives else -1
     behind = False
     for pair in range(column.size):
         for b in range(batch):
@@ -112,25 +123,25 @@ def merge(
         for way in range(start[pair], start[pair + 1]):
             over, row = link[way], stamp_row[way]
             for b in range(batch):
-                if heard[over, b] and (newest[over, b] < number[b]) == late:
-                    at = newest[over, b] % capacity
-                    if sent[at, row, b] > stamp[pair, b]:
-                        stamp[pair, b] = sent[at, row, b]
-                        choice[b], place[b] = way, at
-                        found = True
+                at = place[over, b]
+                if at >= 0 and sent[at, row, b] > stamp[pair, b]:
+                    stamp[pair, b] = sent[at, row, b]
+                    choice[b] = way
+                    found = True
         if not found:
             continue
         for b in range(batch):
             way = choice[b]
             if way < 0:
                 continue
-            at = place[b]
+            at = place[link[way], b]
             for c in range(components[pair]):
                 center[column[pair] + c, b] = sent[at, state[way] + c, b]
+                error[column[pair] + c, b] = noise if error_row[way] < 0 else sent[at, error_row[way] + c, b]
             hops[pair, b] = 1.0 if hops_row[way] < 0 else sent[at, hops_row[way], b] + 1.0
-            arrived[pair, b] = t[b]
+            arrived[pair, b] = now[b]
             lag[pair, b] = t[b] - sent[at, TIME, b]
-            behind = behind or lag[pair, b] > 0.0
+            behind = behind or lag[pair, b] > 1e-12
     return behind
 
 

@@ -8,6 +8,7 @@ adds what it wants to send, and estimates inside the boxes.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,22 +19,27 @@ from numpy.typing import NDArray
 from khop_env.network import Channel, Network
 from khop_env.observers.base import Assumptions, Certified, Extremes, Information, Memory, Plant, PlantState
 from khop_env.observers.certificate import Certificate
-from khop_env.observers.certified import CertifiedBoxes
+from khop_env.observers.certified import report
 from khop_env.observers.design import ObserverDesign
-from khop_env.observers.estimators import Estimator, as_estimator
+from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, largest_share, merge
 from khop_env.observers.reckoning import Reckoning
-from khop_env.physics import AgentModel, hops_from_targets
+from khop_env.observers.rounds import Rounds
+from khop_env.physics import AgentModel, did_you_mean, hops_from_targets
 
 _CHANNEL = "channel."
+
+ESTIMATORS: Mapping[str, type[Estimator]] = {"ppso": Rounds, "relay": Relay}
+"""Estimators by name."""
 
 
 class Networked:
     """Observers over a network of messages; an `Observers`.
 
-    The plant moves by Runge-Kutta steps of order 4, and its inputs are kept within the models' limits, on which the
-    certificates rest. Rounds take place at the first grid point at or after each multiple of the network's period.
+    The plant moves by explicit Euler steps, as with `Proximal(order=1)`, and a law's inputs are kept within the models'
+    limits, on which the certificates rest. Rounds take place at the first grid point at or after each multiple of the
+    network's period.
 
     Args:
         network: how often agents send, and what becomes of messages; anything that `Network.of` reads.
@@ -43,7 +49,7 @@ class Networked:
         network: a `Network`.
         estimator: this object's own copy.
         channel: the links; once prepared.
-        boxes: the certified boxes of all pairs; once prepared.
+        uncertified: agents whose state has no bound in some component, by index, and why; once prepared.
 
     Raises:
         ValueError: for an unknown network or estimator.
@@ -52,6 +58,7 @@ class Networked:
     name = "networked"
     order = 1
     by_messages = True
+    copied = False
 
     def __init__(self, network: Network | Mapping[str, object] | str, estimator: str | Estimator = "ppso") -> None:
         found = Network.of(network)
@@ -62,25 +69,25 @@ class Networked:
     def __repr__(self) -> str:
         return f"Networked({self.network.described()}; {self.estimator.name})"
 
-    @property
-    def longest_step(self) -> float:
-        """Simulators divide steps so that no round is left out, in s."""
-        return self.network.period
-
     def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
         """Allocate buffers, and tabulate the certificates."""
         fleet, layout = design.fleet, design.knowledge
         self.design, self.num_envs, self.layout, self._assumed = design, num_envs, layout, assumed
-        received, initial = _certificates(design, assumed, self.network.noise)
-        self.boxes = CertifiedBoxes(layout, received, initial)
-        self._reckoning = Reckoning(layout, fleet.models, [each.growth for each in received], num_envs)
-        self._sources: Any = tuple(Sources.of(layout, fleet.n))
-        shared = 1 + fleet.n + layout.size + 2 * layout.pairs
+        received = _certificates(design, assumed, self.network.noise)
+        self.uncertified = {i: each.reason for i, each in enumerate(received) if each.reason}
+        self._reckoning = Reckoning(layout, received, num_envs)
+        self.longest_step = min(self.network.period, self._reckoning.longest_step)
+        sources = Sources.of(layout, fleet.n)
+        self._sources: Any = tuple(sources)
+        self._pairs = sources.column, sources.components
+        regions = np.concatenate([each.region for each in received])
+        self._region = regions[layout.column_source]
+        shared = 1 + fleet.n + 2 * (layout.size + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
-        self._proposal = self.estimator.proposal
         self._lag = np.zeros((layout.pairs, num_envs))
-        self._fastest = self._fastest_ages()
+        self._dt = self.longest_step
+        self._fastest = self._fewest_rounds()
 
     def allocate(self) -> Memory:
         """Predictions from what was received, its stamps and ways, the estimates, their bounds; channel; estimator."""
@@ -91,6 +98,7 @@ class Networked:
             "input_estimate": np.zeros((self.design.inputs.layout.size, batch)),
             "bound": np.zeros((size, batch)),
             "center": np.zeros((size, batch)),
+            "error": np.zeros((size, batch)),
             "stamp": np.zeros((pairs, batch)),
             "hops": np.zeros((pairs, batch)),
             "arrived": np.zeros((pairs, batch)),
@@ -104,6 +112,7 @@ class Networked:
         """Start from `first_guess` in the environments `env_ids`, and run their first round."""
         memory = state.memory
         memory["center"][:, env_ids] = first_guess[self.layout.column_source][:, None]
+        memory["error"][:, env_ids] = self._assumed.radius[self.layout.column_source][:, None]
         for name in ("stamp", "arrived"):
             memory[name][:, env_ids] = -1.0
         memory["hops"][:, env_ids] = memory["input_estimate"][:, env_ids] = 0.0
@@ -111,7 +120,8 @@ class Networked:
         self.estimator.reset(memory, env_ids, first_guess)
         due = np.zeros(self.num_envs, np.bool_)
         due[env_ids] = True
-        self._round(state, due, self.network.period)
+        self._begin_round(state, due)
+        self._send(state, due)
         self._report(state)
 
     def advance(self, plant: Plant, before: PlantState, state: PlantState, dt: float) -> None:
@@ -121,14 +131,18 @@ class Networked:
             SolveError: if a state isn't finite.
         """
         memory = state.memory
-        self.estimator.predict(memory, state.t, dt)
-        self._reckoning.advance(memory["center"], state.t, dt)
-        for number, (weights, elapsed) in enumerate(_RUNGE_KUTTA):
-            plant.stage(number, dt * weights, dt * elapsed, before, state)
-            plant.effect(state)
+        plant.stage(0, np.array([dt]), dt, before, state)  # first: nothing has changed yet if it raises
+        plant.effect(state)
         due = self.channel.due(self._of_channel(memory), state.t)
-        if due.any():
-            self._round(state, due, dt)
+        if round_is_due := bool(due.any()):
+            self._begin_round(state, due)
+            if self.network.most_rounds_late:  # as if these had arrived at the last grid point, and moved from there
+                self._merge(True, state, before.t, dt)
+        self.estimator.predict(memory, before.t, dt)
+        self._reckoning.advance(memory["center"], memory["error"], before.t, dt)
+        self._dt = dt
+        if round_is_due:
+            self._send(state, due)
         self._report(state)
         plant.actuate(state)
 
@@ -152,11 +166,18 @@ class Networked:
         Returns:
             `out` (P, B), written.
         """
-        round_, waiting = self._of_channel(state.memory)["round"], self._fastest[:, None]
-        period = self.network.period
-        since_round = state.t - np.maximum(round_, 0) * period
-        stamp = state.t - np.maximum(since_round, 0.0) - waiting * period
-        return self.boxes.radii(state.t, np.where(round_ < waiting, -1.0, np.maximum(stamp, 0.0)), out)
+        h, period = self._dt, self.network.period
+        round_ = self._of_channel(state.memory)["round"]
+        rounds = self._fastest[:, None]
+        since = np.maximum(state.t - round_ * period, 0.0)
+        grid = np.floor((since + rounds * period) / h + 1e-6).astype(np.int64)
+        source = self.layout.column_source
+        from_start = self._reckoning.radii(
+            np.broadcast_to(np.rint(state.t / h).astype(np.int64), grid.shape), self._assumed.radius[source], h
+        )
+        received = self._reckoning.radii(grid, np.full(len(source), self.network.noise), h)
+        out[...] = np.where((round_ < rounds)[self.layout.column_pair], from_start, received)
+        return np.minimum(out, self._region[:, None], out=out)
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
         """Raise running maxima: errors over certified bounds, and the estimator's own |xi| / rho."""
@@ -170,25 +191,27 @@ class Networked:
     def _of_channel(self, memory: Memory) -> Memory:
         return {name[len(_CHANNEL) :]: values for name, values in memory.items() if name.startswith(_CHANNEL)}
 
-    def _round(self, state: PlantState, due: NDArray[np.bool_], dt: float) -> None:
-        """A round: late messages arrive, everybody sends, and messages without delay arrive."""
+    def _begin_round(self, state: PlantState, due: NDArray[np.bool_]) -> None:
+        """Decide what is lost and what arrives."""
+        self.channel.begin_round(self._of_channel(state.memory), None, due)
+
+    def _send(self, state: PlantState, due: NDArray[np.bool_]) -> None:
+        """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived."""
         memory, channel = state.memory, self._of_channel(state.memory)
-        self.channel.begin_round(channel, None, due)
-        if self.network.most_rounds_late:
-            self._merge(True, state, channel, dt)
         shared = [state.t[None], self.channel.measured(channel, state.x)]
-        shared += [memory[name] for name in ("center", "stamp", "hops")]
+        shared += [memory[name] for name in ("center", "error", "stamp", "hops")]
         self.channel.send(channel, [*shared, *self.estimator.message(state)], due)
         if not self.network.fewest_rounds_late:
-            self._merge(False, state, channel, dt)
+            self._merge(False, state, state.t, self._dt)
 
         def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
             self.channel.receive(channel, link, row, held)
 
         self.estimator.receive(state, take, due)
 
-    def _merge(self, late: bool, state: PlantState, channel: Memory, dt: float) -> None:
-        memory = state.memory
+    def _merge(self, late: bool, state: PlantState, t: FloatArray, dt: float) -> None:
+        """Take over fresher states; `t` is the time that predictions are of."""
+        memory, channel = state.memory, self._of_channel(state.memory)
         behind = merge(
             self._sources,
             late,
@@ -196,23 +219,33 @@ class Networked:
             channel["round"],
             channel["newest"],
             channel["heard"],
+            self.network.noise,
+            t,
             state.t,
             memory["center"],
+            memory["error"],
             memory["stamp"],
             memory["hops"],
             memory["arrived"],
             self._lag,
         )
-        if behind and self._reckoning.moves:
-            self._reckoning.catch_up(memory["center"], state.t, self._lag, dt)
+        if behind:
+            self._reckoning.catch_up(memory["center"], memory["error"], t, self._lag, dt)
 
     def _report(self, state: PlantState) -> None:
         memory = state.memory
-        own = memory[self.estimator.proposed] if self.estimator.proposed else memory["center"]
-        held = memory["stamp"], memory["center"]
-        self.boxes.report(state.t, *held, self._proposal, own, memory["estimate"], memory["bound"])
+        report(
+            *self._pairs,
+            self.estimator.proposal,
+            self._region,
+            memory["center"],
+            memory["error"],
+            memory[self.estimator.proposed] if self.estimator.proposed else memory["center"],
+            memory["estimate"],
+            memory["bound"],
+        )
 
-    def _fastest_ages(self) -> FloatArray:
+    def _fewest_rounds(self) -> FloatArray:
         """(pairs,) rounds that a state is old at least when it arrives, by distance and smallest latency."""
         hops = hops_from_targets(self.design.communication, self.design.k)
         distance = np.array(
@@ -223,36 +256,36 @@ class Networked:
         return distance * late if late else distance - 1.0
 
 
-# The classical method of order 4: weights of the rates so far, and the time of the stage, per unit of the step. No
-# weight is negative, so that a disturbance within its bound moves the plant by no more than its bound.
-_RUNGE_KUTTA = tuple(
-    (np.array(weights), elapsed)
-    for weights, elapsed in (
-        ([0.5], 0.5),
-        ([0.0, 0.5], 0.5),
-        ([0.0, 0.0, 1.0], 1.0),
-        ([1 / 6, 1 / 3, 1 / 3, 1 / 6], 1.0),
-    )
-)
+def as_estimator(estimator: str | Estimator) -> Estimator:
+    """An estimator by name, or a copy of an object.
+
+    Raises:
+        ValueError: for an unknown name, or an object that isn't an estimator.
+    """
+    if isinstance(estimator, str):
+        if estimator not in ESTIMATORS:
+            raise ValueError(f"no estimator {estimator!r}; {did_you_mean(estimator, ESTIMATORS)}")
+        return ESTIMATORS[estimator]()
+    missing = [name for name in ("name", "prepare", "message", "receive") if not hasattr(estimator, name)]
+    if missing:
+        raise ValueError(
+            f"an estimator is a name ({', '.join(ESTIMATORS)}) or an Estimator; got {estimator!r}, which has no "
+            f"{missing[0]}"
+        )
+    return copy.copy(estimator)
 
 
-def _certificates(
-    design: ObserverDesign, assumed: Assumptions, noise: float
-) -> tuple[list[Certificate], list[Certificate]]:
-    """Per agent the certificates of a received state and of the initial set; equal ones are one object."""
-    made: dict[tuple[AgentModel, bytes, bytes, bytes], Certificate] = {}
+def _certificates(design: ObserverDesign, assumed: Assumptions, noise: float) -> list[Certificate]:
+    """Per agent the certificate of a state that it sent; equal ones are one object."""
+    made: dict[tuple[AgentModel, bytes, bytes], Certificate] = {}
+    found = []
     reach = np.abs(assumed.center) + assumed.radius
-
-    def certificate(i: int, start: FloatArray) -> Certificate:
-        model, part = design.fleet.models[i], design.fleet.state_slice(i)
+    for i, model in enumerate(design.fleet.models):
+        part = design.fleet.state_slice(i)
         disturbance = assumed.disturbance[part]
         region = model.operating_region(reach[part], disturbance)
-        key = model, disturbance.tobytes(), start.tobytes(), region.tobytes()
+        key = model, disturbance.tobytes(), region.tobytes()
         if key not in made:
-            made[key] = Certificate(model, disturbance=disturbance, start=start, region=region)
-        return made[key]
-
-    fleet = design.fleet
-    received = [certificate(i, np.full(model.n, noise)) for i, model in enumerate(fleet.models)]
-    initial = [certificate(i, assumed.radius[fleet.state_slice(i)]) for i in range(len(fleet))]
-    return received, initial
+            made[key] = Certificate(model, disturbance=disturbance, start=noise, region=region)
+        found.append(made[key])
+    return found

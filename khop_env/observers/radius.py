@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from khop_env.observers.layout import FloatArray
 from khop_env.physics import Growth
@@ -15,7 +13,7 @@ FIRST = 2.0**-7  # s: the table's spacing doubles with the age from here on
 OCTAVES = 23  # up to 65536 s; what is older is not bounded
 KNOTS = 64  # of each octave
 _LARGEST = 1e100
-UP = 1.0 + 1e-6  # rounding: about (n + 20) 2^OCTAVES 2^-53, which is 3e-8
+_UP = 1.0 + 1e-6  # rounding: about (n + 20) 2^OCTAVES 2^-53, which is 3e-8
 
 
 class RadiusTable:
@@ -67,10 +65,6 @@ class RadiusTable:
                 self._bulge[:, k] = 0.5 * h * h * (rise @ z[n + 1 :])
                 z = step @ z
 
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """The table for compiled loops: values and bulges at knots, start, slope, and what is lost, (n, ...) each."""
-        return self._value, self._bulge, self._start, self._slope, self._lost
-
     def at(self, age: FloatArray) -> FloatArray:
         """(n, ...) radii at ages (...), in s, not negative."""
         inside = age < FIRST * 2.0**OCTAVES
@@ -85,7 +79,7 @@ class RadiusTable:
             table = (1.0 - s) * self._value[:, k] + s * self._value[:, k + 1] + s * (1.0 - s) * self._bulge[:, k]
             line = self._start[columns] + np.where(np.asarray(age) > 0.0, self._slope[columns] * age, 0.0)
         unknown = self._lost[columns] | ~inside | np.isnan(table)
-        return np.minimum(np.where(unknown, math.inf, table), np.where(np.isnan(line), math.inf, line)) * UP
+        return np.minimum(np.where(unknown, math.inf, table), np.where(np.isnan(line), math.inf, line)) * _UP
 
 
 def exponential(matrix: FloatArray, t: float) -> FloatArray:

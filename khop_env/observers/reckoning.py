@@ -1,111 +1,149 @@
-"""Dead reckoning of many estimates at once, grid interval by grid interval."""
+"""Dead reckoning of many states at once, with its certified error, in the steps of the simulated plant.
+
+A simulated plant is the difference equation x+ = x + h (f(x) + g + w), so what is certain of it is certain of that. A
+prediction p+ = p + h f(p) parts from it by at most r, component by component:
+
+    r+ = min((I + h Lambda) r, r + h spread) + h (g_bar + w_bar)
+
+wherever h |df_j/dx_j| <= 1, which `longest_step` keeps (docs/theory_certificates.md, "Sampled systems").
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.observers.dead_reckoning import LONGEST_STEP, extended_drift
-from khop_env.observers.layout import FloatArray, PairLayout
-from khop_env.physics import AgentModel, Growth, read_only
+from khop_env.compiled import compiled
+from khop_env.observers.certificate import Certificate
+from khop_env.observers.dead_reckoning import extended_drift
+from khop_env.observers.layout import FloatArray, IntArray, PairLayout
+from khop_env.physics import AgentModel, read_only
+
+_ROUNDING = 1e-15  # of a state, per step
+_STEPS = 8.0  # of `Growth.step`, which is 1/16 over the largest rate: h |df/dx| <= 1/2
 
 
 class _Run(NamedTuple):
-    """Consecutive targets with equal models."""
+    """Consecutive targets with equal models that drift."""
 
     drift: Callable[[FloatArray, FloatArray], FloatArray]
-    longest: float
     columns: slice
     pairs: slice
     components: int
 
 
 class Reckoning:
-    """Moves predicted states p' = f_i(p) by one classical Runge-Kutta step of order 4 per interval.
-
-    Intervals that are longer than a model's `Growth.step` are divided. Models that don't drift aren't moved.
+    """Moves predictions and their certified errors by one interval of the simulator's grid.
 
     Args:
         layout: of the predictions.
-        models: one per agent of the fleet.
-        growths: likewise, None where a model declares none.
+        certificates: per agent of the fleet, with its growth, disturbance and region.
         num_envs: number of environments B.
+
+    Attributes:
+        longest_step: longest interval, in s.
     """
 
-    def __init__(
-        self, layout: PairLayout, models: Sequence[AgentModel], growths: Sequence[Growth | None], num_envs: int
-    ) -> None:
-        self._num_envs, self._pair = num_envs, layout.column_pair
+    def __init__(self, layout: PairLayout, certificates: Sequence[Certificate], num_envs: int) -> None:
+        self._num_envs, self._layout = num_envs, layout
+        growths = [certificates[i].growth for i in layout.target.tolist()]
+        self.longest_step = min((_STEPS * growth.step for growth in growths if growth is not None), default=math.inf)
         self._runs: list[_Run] = []
-        last: tuple[AgentModel, Growth | None] | None = None
-        for block in layout.blocks:
-            model, growth = models[block.agent], growths[block.agent]
+        last: tuple[AgentModel, bytes] | None = None
+        matrices: list[FloatArray] = []
+        for block, growth in zip(layout.blocks, growths, strict=True):
+            certificate, n = certificates[block.agent], block.components
+            model, region = certificate.model, certificate.region.tobytes()
+            matrices.append(np.zeros((n, n)) if growth is None else growth.matrix)
             if growth is not None and not growth.matrix.any() and not growth.spread.any():
                 continue
             columns, pairs = block.columns, block.pairs
-            adjacent = bool(self._runs) and self._runs[-1].columns.stop == columns.start
-            if adjacent and last is not None and last[0] == model and last[1] is growth:
+            if last == (model, region) and self._runs[-1].columns.stop == columns.start:
                 first = self._runs.pop()
                 columns, pairs = slice(first.columns.start, columns.stop), slice(first.pairs.start, pairs.stop)
-            longest = LONGEST_STEP if growth is None else growth.step
-            self._runs.append(_Run(extended_drift(model, growth), longest, columns, pairs, block.components))
-            last = model, growth
+            self._runs.append(_Run(extended_drift(model, growth), columns, pairs, n))
+            last = model, region
+        each = [certificates[i] for i in layout.target.tolist()]
+        nothing = [np.zeros(0)]
+        arrays = layout.arrays
+        self._arrays: Any = (
+            arrays.observers,
+            arrays.components,
+            arrays.column,
+            arrays.pair,
+            arrays.row,
+            np.cumsum([0, *(m.size for m in matrices)])[:-1],
+            np.concatenate([*nothing, *(m.ravel() for m in matrices)]),
+            np.concatenate([*nothing, *(np.zeros(c.model.n) if c.growth is None else c.growth.spread for c in each)]),
+            np.concatenate([*nothing, *(np.full(c.model.n, math.inf) if c.growth is None else c.rate for c in each)]),
+        )
+        self._rate = np.zeros((layout.size, num_envs))
+        self._length = np.zeros((layout.pairs, num_envs))
 
-    @property
-    def moves(self) -> bool:
-        """Whether any prediction moves."""
-        return bool(self._runs)
+    def advance(self, p: FloatArray, r: FloatArray, t: FloatArray, h: float) -> None:
+        """Move predictions `p` (P, B) and errors `r` (P, B) from the times `t` (B,) by `h` seconds, in place."""
+        self._length.fill(h)
+        self._move(p, r, t[:, None])
 
-    def advance(self, p: FloatArray, t: FloatArray, h: float) -> None:
-        """Move all predictions `p` (P, B) from the times `t` (B,) by `h` seconds, in place."""
+    def catch_up(self, p: FloatArray, r: FloatArray, t: FloatArray, lag: FloatArray, h: float) -> None:
+        """Move what is `lag` (pairs, B) seconds old to the times `t` (B,), in intervals of about `h`, as `advance`."""
+        intervals = np.where(lag > 1e-9 * h, np.maximum(1.0, np.rint(lag / h)), 0.0)
+        for number in range(int(intervals.max(initial=0.0))):
+            with np.errstate(invalid="ignore", divide="ignore"):
+                self._length[...] = np.where(intervals > number, lag / intervals, 0.0)
+            self._move(p, r, (t - lag + number * self._length).T)
+
+    def radii(self, steps: IntArray, start: FloatArray, h: float) -> FloatArray:
+        """(P, B) certified errors `steps` (pairs, B) intervals of `h` seconds after errors `start` (P,)."""
+        steps = steps[self._layout.column_pair]
+        r = start[:, None].copy()
+        out = np.broadcast_to(r, steps.shape).copy()
+        zero, length = np.zeros_like(r), np.full((self._layout.pairs, 1), h)
+        for number in range(int(steps.max(initial=0))):
+            move(self._arrays, length, zero, zero, r)
+            np.copyto(out, r, where=steps == number + 1)
+        return out
+
+    def _move(self, p: FloatArray, r: FloatArray, t: FloatArray) -> None:
         for run in self._runs:
-            steps = max(1, math.ceil(h / run.longest - 1e-9))
-            for k in range(steps):
-                self._step(run, p, t[:, None] + k * (h / steps), np.array(h / steps))
+            count = run.pairs.stop - run.pairs.start
+            states = read_only(p[run.columns].T.reshape(self._num_envs, count, run.components))
+            times = read_only(t[:] if t.shape[1] == 1 else t[:, run.pairs])
+            self._rate[run.columns] = run.drift(times, states).reshape(self._num_envs, -1).T
+        move(self._arrays, self._length, self._rate, p, r)
 
-    def catch_up(self, p: FloatArray, t: FloatArray, lag: FloatArray, h: float) -> None:
-        """Move predictions that are `lag` (pairs, B) seconds old to the times `t` (B,), in intervals of about `h`.
 
-        Args:
-            p: (P, B) changed where `lag` is positive.
-            t: (B,) in s.
-            lag: (pairs, B) in s, 0 for predictions that are of now.
-            h: the interval between grid times in s.
-        """
-        for run in self._runs:
-            behind = lag[run.pairs]
-            intervals = np.where(behind > 0.0, np.maximum(1.0, np.rint(behind / h)), 0.0)
-            most, steps = int(intervals.max(initial=0.0)), max(1, math.ceil(h / run.longest - 1e-9))
-            for number in range(most):
-                with np.errstate(invalid="ignore"):
-                    length = np.where(intervals > number, behind / intervals, 0.0)
-                start = t - behind + number * length
-                for k in range(steps):
-                    part = length / steps
-                    self._step(run, p, (start + k * part).T, np.repeat(part, run.components, axis=0))
-
-    def _step(self, run: _Run, p: FloatArray, t: FloatArray, h: FloatArray) -> None:
-        """One step of a run's predictions; `t` (B, 1) or (B, pairs), `h` () or (columns, B)."""
-        x = p[run.columns]
-        count = run.pairs.stop - run.pairs.start
-        middle = t + 0.5 * h.T if h.ndim == 0 else t + 0.5 * h[:: run.components].T
-        end = t + h if h.ndim == 0 else t + h[:: run.components].T
-
-        def rate(t: FloatArray, x: FloatArray) -> FloatArray:
-            states = read_only(x.T.reshape(self._num_envs, count, run.components))
-            return np.asarray(run.drift(read_only(t[:]), states).reshape(self._num_envs, -1).T)
-
-        k1 = rate(t, x)
-        half = 0.5 * h
-        k2 = rate(middle, x + half * k1)
-        k3 = rate(middle, x + half * k2)
-        k4 = rate(end, x + h * k3)
-        total = k2 + k3
-        total *= 2.0
-        total += k1
-        total += k4
-        total *= h / 6.0
-        x += total
+@compiled
+def move(arrays: Any, length: FloatArray, rate: FloatArray, p: FloatArray, r: FloatArray) -> None:
+    """P += h rate, and the certified errors r likewise; `length` (pairs, B) is h, of 0 where nothing moves."""
+    observers, components, columns, pairs, rows, starts, matrix, spread, pushed = arrays
+    batch = p.shape[1]
+    most = 1
+    for i in range(components.size):
+        most = max(most, components[i])
+    before = np.empty((most, batch))
+    for i in range(observers.size):
+        n = components[i]
+        for a in range(observers[i]):
+            pair, column = pairs[i] + a, columns[i] + a * n
+            for c in range(n):
+                for b in range(batch):
+                    before[c, b] = r[column + c, b]
+            for c in range(n):
+                q, row = column + c, rows[i] + c
+                most_apart, c_bar = spread[row], pushed[row]
+                for b in range(batch):
+                    r[q, b] = 0.0
+                for k in range(n):
+                    slope = matrix[starts[i] + c * n + k]
+                    if slope != 0.0:
+                        for b in range(batch):
+                            r[q, b] += slope * before[k, b]
+                for b in range(batch):
+                    h = length[pair, b]
+                    wider = h * (min(r[q, b], most_apart) + c_bar) + _ROUNDING * abs(p[q, b])
+                    r[q, b] = before[c, b] + (wider if h > 0.0 and before[c, b] < math.inf else 0.0)
+                    p[q, b] += h * rate[q, b]

@@ -41,7 +41,7 @@ _LONG_STEP = 1.0  # in eps: beyond it exp is not nearly linear
 
 
 @inlined
-def _barrier(eps: float) -> tuple[float, float, float]:
+def barrier(eps: float) -> tuple[float, float, float]:
     """(e, z, d eps / dz) with e = tanh(eps / 2) and z = phi'(e) = eps (1 + cosh eps); de/dz = de/deps d eps/dz."""
     a = abs(eps)
     growth = expm1(a)
@@ -64,24 +64,22 @@ def eps_near_impulse(z: float) -> float:
     growth = log(1.0 + 2.0 * target)
     lambert = growth * (1.0 - log(1.0 + growth) / (2.0 + growth))
     a = 0.5 * target if target < 0.5 else min(0.5 * target, lambert)
-    e, value, _ = _barrier(a)
+    e, value, _ = barrier(a)
     a -= 2.0 * a * (value - target) / ((value + target) * (1.0 + a * e))
     return math.copysign(a, z)
 
 
 @compiled
-def _barriers(
-    rows: int, lanes: int, stride: int, u: FloatArray, e: FloatArray, z: FloatArray, gain: FloatArray
-) -> None:
+def barriers(rows: int, lanes: int, stride: int, u: FloatArray, e: FloatArray, z: FloatArray, gain: FloatArray) -> None:
     """The barrier at `lanes` entries of each row of flat arrays, in one long loop where nothing lies between rows."""
     if lanes == stride:
         for q in range(rows * lanes):
-            e[q], z[q], gain[q] = _barrier(u[q])
+            e[q], z[q], gain[q] = barrier(u[q])
     else:
         for a in range(rows):
             for lane in range(lanes):
                 q = place(a * stride + lane)
-                e[q], z[q], gain[q] = _barrier(u[q])
+                e[q], z[q], gain[q] = barrier(u[q])
 
 
 @compiled
@@ -252,11 +250,11 @@ def solve(
             iteration = 0
             moving = True
             while moving:
-                _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
+                barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 if iteration == 0 and _start_anew(
                     eta, pair, lanes, relay, scale, b, e, z, gain, u, pivot, worst, poison
                 ):
-                    _barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
+                    barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 if one_way:
                     newton_step_one_way(
                         eta,

@@ -97,7 +97,7 @@ class Simulator:
             drawn=np.zeros((num_envs, 0 if attached is None else attached.draws)),
             memory=self.observers.allocate(),
         )
-        self._before = self.state.copy()
+        self._before, self._interrupted = self.state.copy(), False
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach = np.abs(initial.center) + initial.radius
         self._longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
@@ -193,6 +193,7 @@ class Simulator:
         generators = [np.random.default_rng(each) for each in seeds]  # raises for an invalid seed
         start = self._initial_states(x0, len(chosen))
         state, disturbance = self.state, self.plant.disturbance
+        self._interrupted &= len(chosen) < self.num_envs
         for b, rng in zip(chosen, generators, strict=True):
             state.x[:, b] = self.initial.draw(rng)
             if disturbance is not None:
@@ -258,17 +259,23 @@ class Simulator:
             dt: step in s.
             parts: `parts_of(dt)`.
         """
-        state, before = self.state, self._before
+        if self._interrupted:
+            raise RuntimeError(
+                "the last step was interrupted half-way: reset all environments, or restore a saved state, to go on"
+            )
+        state, before, copied = self.state, self._before, self.observers.copied
+        whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
         start = state.copy() if parts > 1 else before
-        state.copy_step(before)
+        state.copy_step(before, copied)
         try:
             for part in range(parts):
                 if part:
-                    state.copy_step(before)
+                    state.copy_step(before, copied)
                 self.observers.advance(self.plant, before, state, dt / parts)
                 self.observers.raise_extremes(state, self.running_extremes)
-        except BaseException:
-            start.copy_step(state)
+        except BaseException as error:
+            start.copy_step(state, whole)
+            self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
             raise
 
     def warm_up(self) -> None:
@@ -293,6 +300,7 @@ class Simulator:
             ValueError: if it was saved by a simulator of other dimensions or other observers.
         """
         self.state.assign(saved)
+        self._interrupted = False
         self.restart_extremes()
         self.observers.raise_extremes(self.state, self.running_extremes)
 

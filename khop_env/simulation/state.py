@@ -42,12 +42,18 @@ class SimulatorState:
         t, x, u, g, drawn = (array.copy() for array in (self.t, self.x, self.u, self.g, self.drawn))
         return SimulatorState(t, x, u, g, drawn, memory)
 
-    def copy_step(self, other: SimulatorState) -> None:
-        """Copy the arrays that a step changes into `other`, of the same shapes: all but the episode's draws."""
+    def copy_step(self, other: SimulatorState, memory: bool = True) -> None:
+        """Copy the arrays that a step changes into `other`, of the same shapes: all but the episode's draws.
+
+        Args:
+            other: changed.
+            memory: whether the observers' memory is copied, too.
+        """
         for ours, theirs in ((self.t, other.t), (self.x, other.x), (self.u, other.u), (self.g, other.g)):
             np.copyto(theirs, ours)
-        for name, ours in self.memory.items():
-            np.copyto(other.memory[name], ours)
+        if memory:
+            for name, values in self.memory.items():
+                np.copyto(other.memory[name], values)
 
     def assign(self, other: SimulatorState) -> None:
         """Overwrite this state in place; memory of `other` that these observers don't have is left out.

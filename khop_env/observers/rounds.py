@@ -1,0 +1,191 @@
+"""The paper's observers by implicit rounds: each agent solves its own scalar equations with what it got last.
+
+With the last estimates and relayed states that it holds, observer a of target i solves, once a round and with the
+period as the step tau,
+
+    y - y* + tau phi'(e) / rho = 0,    e = (d y - sum of what it holds) / rho,
+
+d values in all: the row of M_i that is its own. It is the proximal step of `solve` on one row, so |e| < 1 whatever
+has arrived, and with many rounds in the place of one the rows agree on the proximal step of all.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.network import Network
+from khop_env.observers.base import Extremes, Memory, PlantState, WidthsNow
+from khop_env.observers.design import ObserverDesign
+from khop_env.observers.estimators import Take
+from khop_env.observers.layout import FloatArray, IntArray, PairLayout
+from khop_env.observers.prediction import Prediction
+from khop_env.observers.scalar import solve_alone
+
+
+class _Held(NamedTuple):
+    """What the observers of one layout hold of others' messages, each value in the place of (pair, source, component).
+
+    Attributes:
+        link: (C,) over which it comes.
+        row: (C,) its row in what all agents send.
+        start: (pairs + 1,) where each pair's sources begin, counted in sources.
+        offset: (pairs,) place of a pair's first value.
+        source: (C,) index in the fleet's vector of the component it is about.
+    """
+
+    link: IntArray
+    row: IntArray
+    start: IntArray
+    offset: IntArray
+    source: IntArray
+
+
+class Rounds:
+    """The paper's observers of states and inputs (PPSO and PPIO), by one implicit solve per agent, target and round.
+
+    What is held is used as it came: neither predicted nor aged. All of its memory begins with "ppso.": "estimate" and
+    "input_estimate", "held" and "input_held" of other agents, "neighbor_input", the inputs last heard of neighbours,
+    and of the last round "eps", "input_eps" and the disagreements over their funnels, "normalized" and
+    "input_normalized".
+    """
+
+    name = "ppso"
+    proposed = "ppso.estimate"
+
+    def prepare(self, design: ObserverDesign, network: Network, num_envs: int, first_row: int) -> None:
+        """Find the place in the messages of everything that observers hold; see `Estimator`."""
+        self._design, self._num_envs, self._period = design, num_envs, network.period
+        fleet, knowledge, states, inputs = design.fleet, design.knowledge, design.states.layout, design.inputs.layout
+        self.proposal = np.array(
+            [
+                states.slot.get((a, i), -1)
+                for i, a in zip(knowledge.pair_target.tolist(), knowledge.observer.tolist(), strict=True)
+            ],
+            np.int64,
+        )
+        self._neighbors = np.flatnonzero(knowledge.arrays.relay)  # pairs (agent, neighbour)
+        # rows: own g (n), estimates (P), input estimates (Q), the inputs last heard of neighbours
+        own_input, estimate = first_row, first_row + fleet.n
+        input_estimate = estimate + states.size
+        neighbor_input = input_estimate + inputs.size
+        place, columns, links = dict[tuple[int, int], int](), list[int](), list[int]()
+        for pair in self._neighbors.tolist():
+            a, i = int(knowledge.observer[pair]), int(knowledge.pair_target[pair])
+            place[a, i] = len(columns)
+            columns += range(fleet.state_slice(i).start, fleet.state_slice(i).stop)
+            links += [design.links.index[i, a]] * fleet.models[i].n
+        self._input_link, self._input_row = np.array(links, np.int64), own_input + np.array(columns, np.int64)
+        self.width = fleet.n + states.size + inputs.size + len(columns)
+        known = {pair: 1 + fleet.n + start for pair, start in knowledge.slot.items()}
+        heard = {pair: neighbor_input + start for pair, start in place.items()}
+        self._states = _held(states, estimate, 1, known)
+        self._inputs = _held(inputs, input_estimate, own_input, heard)
+        self._rho, self._omega = WidthsNow(design.states.rho, num_envs), WidthsNow(design.inputs.rho, num_envs)
+        self._prediction = Prediction(design, num_envs)
+        self._rate = np.zeros((states.size, num_envs))
+
+    def allocate(self) -> Memory:
+        """See the class."""
+        batch, states, inputs = self._num_envs, self._design.states.layout, self._design.inputs.layout
+        return {
+            "ppso.estimate": np.zeros((states.size, batch)),
+            "ppso.input_estimate": np.zeros((inputs.size, batch)),
+            "ppso.held": np.zeros((len(self._states.link), batch)),
+            "ppso.input_held": np.zeros((len(self._inputs.link), batch)),
+            "ppso.neighbor_input": np.zeros((len(self._input_link), batch)),
+            "ppso.eps": np.zeros((states.size, batch)),
+            "ppso.input_eps": np.zeros((inputs.size, batch)),
+            "ppso.normalized": np.zeros((states.size, batch)),
+            "ppso.input_normalized": np.zeros((inputs.size, batch)),
+        }
+
+    def reset(self, memory: Memory, env_ids: IntArray, first_guess: FloatArray) -> None:
+        """Start estimates and what is held from `first_guess`, inputs from 0, in the environments `env_ids`."""
+        for name in self.allocate():
+            memory[name][:, env_ids] = 0.0
+        memory["ppso.estimate"][:, env_ids] = first_guess[self._design.states.layout.column_source][:, None]
+        memory["ppso.held"][:, env_ids] = first_guess[self._states.source][:, None]
+
+    def predict(self, memory: Memory, t: FloatArray, dt: float) -> None:
+        """Y += dt (f(y) + g_hat), explicit Euler as in the proximal step of order 1."""
+        estimate = memory["ppso.estimate"]
+        self._prediction.rate(t, estimate, memory["ppso.input_estimate"], self._rate)
+        self._rate *= dt
+        estimate += self._rate
+
+    def message(self, state: PlantState) -> list[FloatArray]:
+        """Own inputs' effects, estimates of states and inputs, and the inputs' effects last heard of neighbours."""
+        memory = state.memory
+        return [state.g, *(memory[f"ppso.{name}"] for name in ("estimate", "input_estimate", "neighbor_input"))]
+
+    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_]) -> None:
+        """Hold what has come, and solve in the environments that are `due`."""
+        memory, design = state.memory, self._design
+        take(self._input_link, self._input_row, memory["ppso.neighbor_input"])
+        for held, funnels, widths, name in (
+            (self._states, design.states, self._rho, ""),
+            (self._inputs, design.inputs, self._omega, "input_"),
+        ):
+            if not funnels.layout.size:
+                continue
+            values = memory[f"ppso.{name}held"]
+            take(held.link, held.row, values)
+            solve_alone(
+                funnels.layout.packed,
+                held.start,
+                held.offset,
+                self._period,
+                values,
+                widths.at(state.t),
+                due,
+                memory[f"ppso.{name}eps"],
+                memory[f"ppso.{name}estimate"],
+                memory[f"ppso.{name}normalized"],
+            )
+        memory["input_estimate"][...] = memory["ppso.input_estimate"]
+
+    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+        """Raise the largest |xi| / rho and |mu| / omega, of the disagreements at the last round."""
+        for name, largest in (
+            ("ppso.normalized", extremes.normalized),
+            ("ppso.input_normalized", extremes.input_normalized),
+        ):
+            values = state.memory[name]
+            if len(values):
+                np.maximum(largest, np.abs(values).max(axis=0), out=largest)
+
+
+def _held(layout: PairLayout, estimate: int, own: int, relayed: dict[tuple[int, int], int]) -> _Held:
+    """Places of what the observers of a layout hold: others' estimates, then relayed values, pair by pair.
+
+    Args:
+        layout: the pairs.
+        estimate: row at which their estimates begin in what is sent.
+        own: row at which the fleet's own values begin.
+        relayed: (relaying agent, target) -> row of the target's value in what that agent sends.
+    """
+    arrays, sender = layout.arrays, layout.links.sender
+    link, row, source, offset = list[int](), list[int](), list[int](), list[int]()
+    start = [0]
+    for block in layout.blocks:
+        span = range(block.components)
+        for pair in range(block.pairs.start, block.pairs.stop):
+            offset.append(len(link))
+            entries = range(arrays.entry_start[pair], arrays.entry_start[pair + 1])
+            ways = [
+                (int(layout.entry_link[k]), estimate + block.columns.start + int(arrays.entry[k]) * block.components)
+                for k in entries
+            ]
+            for number in layout.relay_link[layout.relay_start[pair] : layout.relay_start[pair + 1]].tolist():
+                p, i = int(sender[number]), block.agent
+                ways.append((number, own + block.sources.start if p == i else relayed[p, i]))
+            for number, first in ways:
+                link += [number] * block.components
+                row += [first + c for c in span]
+                source += [block.sources.start + c for c in span]
+            start.append(start[-1] + len(ways))
+    parts = (link, row, start, offset, source)
+    return _Held(*(np.array(part, np.int64) for part in parts))

@@ -1,0 +1,141 @@
+"""The proximal step of one observer alone: one scalar equation for each component, with what it holds of others."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.compiled import compiled, place
+from khop_env.observers.layout import FloatArray, IntArray, PairArrays
+from khop_env.observers.solve import LANES, barrier, barriers, eps_near_impulse
+
+_FEW, _MANY = 8, 100  # iterations from a warm start; between bounds, where bisection alone would take 60
+_SMALL = 1e-6  # in eps: the error after such a step of Newton's method is its square
+_EXACT = 4e-16
+
+
+@compiled
+def solve_alone(
+    pairs: PairArrays,
+    start: IntArray,
+    offset: IntArray,
+    tau: float,
+    held: FloatArray,
+    rho: FloatArray,
+    due: NDArray[np.bool_],
+    eps: FloatArray,
+    estimate: FloatArray,
+    normalized: FloatArray,
+) -> None:
+    """Solve y - y* + tau z / rho = 0, z = phi'(e), e = (d y - sum of what is held) / rho, for every pair.
+
+    In z it is e(z) + s d z = b with s = tau / rho^2 and b = (d y* - sum) / rho: increasing, so that it has one root.
+
+    Args:
+        pairs: `PairLayout.packed`.
+        start: (pairs + 1,) where each pair's sources begin, d of them.
+        offset: (pairs,) place of its first value in `held`: source by source, component by component.
+        tau: period in s.
+        held: (C, B) what was received last.
+        rho: (rows, B) the funnels.
+        due: (B,) environments in which to solve; the others keep every bit.
+        eps: (P, B) T(e); the last one on entry, the new one on return.
+        estimate: (P, B) y* on entry, y on return.
+        normalized: (P, B) e, written.
+    """
+    pairs = PairArrays(*pairs)
+    batch = due.size
+    lanes = np.empty((9, LANES))
+    target, weight, inverse, total, u = lanes[0], lanes[1], lanes[2], lanes[3], lanes[4]
+    e, z, gain, active = lanes[5], lanes[6], lanes[7], lanes[8]
+    for i in range(pairs.observers.size):
+        n = pairs.components[i]
+        for a in range(pairs.observers[i]):
+            pair = pairs.pair[i] + a
+            sources = start[pair + 1] - start[pair]
+            d = float(sources)
+            for c in range(n):
+                column, row = pairs.column[i] + a * n + c, pairs.row[i] + c
+                for first in range(0, batch, LANES):
+                    width = min(LANES, batch - first)
+                    for lane in range(width):
+                        total[lane] = 0.0
+                    for k in range(sources):
+                        source = offset[pair] + k * n + c
+                        for lane in range(width):
+                            total[lane] += held[source, place(first + lane)]
+                    for lane in range(width):
+                        at = place(first + lane)
+                        inverse[lane] = 1.0 / rho[row, at]
+                        target[lane] = (d * estimate[column, at] - total[lane]) * inverse[lane]
+                        weight[lane] = d * tau * inverse[lane] * inverse[lane]
+                        u[lane] = eps[column, at]
+                    _newton(width, target, weight, u, e, z, gain, active)
+                    for lane in range(width):
+                        at = place(first + lane)
+                        if due[at]:
+                            eps[column, at] = u[lane]
+                            normalized[column, at] = e[lane]
+                            # from e, not from z: no digits are lost in stiff equations
+                            estimate[column, at] = (total[lane] + rho[row, at] * e[lane]) / d
+
+
+@compiled
+def _newton(
+    width: int,
+    target: FloatArray,
+    weight: FloatArray,
+    u: FloatArray,
+    e: FloatArray,
+    z: FloatArray,
+    gain: FloatArray,
+    active: FloatArray,
+) -> None:
+    """Newton's method from warm starts u; where it isn't quick, anew between bounds. Leaves u and e."""
+    for lane in range(width):
+        active[lane] = 1.0
+    moving = True
+    for _ in range(_FEW):
+        barriers(1, width, LANES, u, e, z, gain)
+        worst = 0.0
+        for lane in range(width):
+            slope = 0.5 * (1.0 - e[lane] * e[lane])
+            step = (e[lane] + weight[lane] * z[lane] - target[lane]) / (slope + weight[lane] / gain[lane])
+            step = step * active[lane]  # a lane that has converged stays: its result mustn't depend on the others
+            u[lane] -= step
+            e[lane] -= slope * step
+            active[lane] = 1.0 if not abs(step) <= _SMALL else 0.0
+            worst = max(worst, active[lane])
+        moving = worst > 0.0
+        if not moving:
+            return
+    for lane in range(width):
+        if active[lane] > 0.0:
+            u[lane], e[lane] = _between_bounds(target[lane], weight[lane])
+
+
+@compiled
+def _between_bounds(target: float, weight: float) -> tuple[float, float]:
+    """(eps, e) of one equation; the root lies between the impulses (|b| - 1) / (s d) and |b| / (s d)."""
+    b = abs(target)
+    high = eps_near_impulse(b / weight) * 1.01
+    if b < 1.0:
+        high = min(high, math.log((1.0 + b) / (1.0 - b)) * 1.01)
+    low = eps_near_impulse(max(b - 1.0, 0.0) / weight) * 0.99
+    u = high
+    for _ in range(_MANY):
+        e, z, gain = barrier(u)
+        excess = e + weight * z - b
+        if excess > 0.0:
+            high = u
+        else:
+            low = u
+        following = u - excess / (0.5 * (1.0 - e * e) + weight / gain)
+        if not low <= following <= high:
+            following = 0.5 * (low + high)
+        if abs(following - u) <= _EXACT * (1.0 + u):
+            break
+        u = following
+    return math.copysign(u, target), math.copysign(e, target)
