@@ -56,7 +56,10 @@ class Rounds:
     proposed = "ppso.estimate"
 
     def prepare(self, design: ObserverDesign, network: Network, num_envs: int, first_row: int) -> None:
-        """Find the place in the messages of everything that observers hold; see `Estimator`."""
+        """Find the places of what observers of `design` hold in messages, whose rows begin at `first_row`.
+
+        Rounds last the `network`'s period, in `num_envs` environments.
+        """
         self._design, self._num_envs, self._period = design, num_envs, network.period
         fleet, knowledge, states, inputs = design.fleet, design.knowledge, design.states.layout, design.inputs.layout
         self.proposal = np.array(
