@@ -12,6 +12,7 @@ import networkx as nx
 import numpy as np
 from hypothesis import strategies as st
 
+from khop_env.network import Network
 from khop_env.observers import DesignRule, Exponential, Funnels, ObserverDesign, Observers, PairLayout, TargetObservers
 from khop_env.physics import (
     BandLimitedNoise,
@@ -29,6 +30,16 @@ from khop_env.physics import (
 from khop_env.simulation import InitialSet, Simulator, View
 
 SEEDS = st.integers(0, 2**32 - 1)
+NETWORKS = st.builds(
+    lambda loss, burst, latency, jitter, period: Network(
+        period, loss, None if burst is None else max(burst, loss[1] / (1.0 - loss[1])), latency, min(jitter, latency[0])
+    ),
+    loss=st.tuples(st.floats(0, 0.45), st.floats(0.45, 0.9)),
+    burst=st.sampled_from([None, 1.0, 5.0, 20.0]),
+    latency=st.tuples(st.floats(0, 0.2), st.floats(0.2, 0.4)),
+    jitter=st.floats(0, 0.2),
+    period=st.sampled_from([0.005, 0.05, 0.1]),
+)
 PLANAR = (
     SingleIntegrator(),
     DriftingIntegrator(input_limit=3.0),

@@ -82,6 +82,7 @@ class Networked:
         self._pairs = sources.column, sources.components
         regions = np.concatenate([each.region for each in received])
         self._region = regions[layout.column_source]
+        self.estimator = copy.copy(self.estimator)  # its buffers are this object's own
         shared = 1 + fleet.n + 2 * (layout.size + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
@@ -117,11 +118,13 @@ class Networked:
             memory[name][:, env_ids] = -1.0
         memory["hops"][:, env_ids] = memory["input_estimate"][:, env_ids] = 0.0
         self.channel.reset(self._of_channel(memory), env_ids, rngs)
+        heard = memory[_CHANNEL + "heard"].copy()
         self.estimator.reset(memory, env_ids, first_guess)
         due = np.zeros(self.num_envs, np.bool_)
         due[env_ids] = True
         self._begin_round(state, due)
         self._send(state, due)
+        np.copyto(memory[_CHANNEL + "heard"], heard, where=~due)  # the others' last round is as it was
         self._report(state)
 
     def advance(self, plant: Plant, before: PlantState, state: PlantState, dt: float) -> None:
@@ -134,14 +137,16 @@ class Networked:
         plant.stage(0, np.array([dt]), dt, before, state)  # first: nothing has changed yet if it raises
         plant.effect(state)
         due = self.channel.due(self._of_channel(memory), state.t)
-        if round_is_due := bool(due.any()):
-            self._begin_round(state, due)
-            if self.network.most_rounds_late:  # as if these had arrived at the last grid point, and moved from there
-                self._merge(True, state, before.t, dt)
+        self._begin_round(state, due)
+        rounds = bool(due.any())
+        if rounds and self.network.most_rounds_late:
+            self._merge(
+                True, state, before.t, dt
+            )  # as if they had arrived at the last grid point, and moved from there
         self.estimator.predict(memory, before.t, dt)
         self._reckoning.advance(memory["center"], memory["error"], before.t, dt)
         self._dt = dt
-        if round_is_due:
+        if rounds:
             self._send(state, due)
         self._report(state)
         plant.actuate(state)

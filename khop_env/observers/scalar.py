@@ -47,9 +47,9 @@ def solve_alone(
     """
     pairs = PairArrays(*pairs)
     batch = due.size
-    lanes = np.empty((9, LANES))
+    lanes = np.empty((10, LANES))
     target, weight, inverse, total, u = lanes[0], lanes[1], lanes[2], lanes[3], lanes[4]
-    e, z, gain, active = lanes[5], lanes[6], lanes[7], lanes[8]
+    e, z, gain, active, answer = lanes[5], lanes[6], lanes[7], lanes[8], lanes[9]
     for i in range(pairs.observers.size):
         n = pairs.components[i]
         for a in range(pairs.observers[i]):
@@ -72,14 +72,14 @@ def solve_alone(
                         target[lane] = (d * estimate[column, at] - total[lane]) * inverse[lane]
                         weight[lane] = d * tau * inverse[lane] * inverse[lane]
                         u[lane] = eps[column, at]
-                    _newton(width, target, weight, u, e, z, gain, active)
+                    _newton(width, target, weight, u, e, z, gain, active, answer)
                     for lane in range(width):
                         at = place(first + lane)
                         if due[at]:
                             eps[column, at] = u[lane]
-                            normalized[column, at] = e[lane]
+                            normalized[column, at] = answer[lane]
                             # from e, not from z: no digits are lost in stiff equations
-                            estimate[column, at] = (total[lane] + rho[row, at] * e[lane]) / d
+                            estimate[column, at] = (total[lane] + rho[row, at] * answer[lane]) / d
 
 
 @compiled
@@ -92,8 +92,9 @@ def _newton(
     z: FloatArray,
     gain: FloatArray,
     active: FloatArray,
+    answer: FloatArray,
 ) -> None:
-    """Newton's method from warm starts u; where it isn't quick, anew between bounds. Leaves u and e."""
+    """Newton's method from warm starts u; where it isn't quick, anew between bounds. Writes u and e, the `answer`."""
     for lane in range(width):
         active[lane] = 1.0
     moving = True
@@ -103,17 +104,18 @@ def _newton(
         for lane in range(width):
             slope = 0.5 * (1.0 - e[lane] * e[lane])
             step = (e[lane] + weight[lane] * z[lane] - target[lane]) / (slope + weight[lane] / gain[lane])
-            step = step * active[lane]  # a lane that has converged stays: its result mustn't depend on the others
-            u[lane] -= step
-            e[lane] -= slope * step
-            active[lane] = 1.0 if not abs(step) <= _SMALL else 0.0
+            # a lane that has converged stays: its result mustn't depend on the others
+            on = active[lane] > 0.0
+            u[lane] -= step if on else 0.0
+            answer[lane] = e[lane] - slope * step if on else answer[lane]
+            active[lane] = 1.0 if on and not abs(step) <= _SMALL else 0.0
             worst = max(worst, active[lane])
         moving = worst > 0.0
         if not moving:
             return
     for lane in range(width):
         if active[lane] > 0.0:
-            u[lane], e[lane] = _between_bounds(target[lane], weight[lane])
+            u[lane], answer[lane] = _between_bounds(target[lane], weight[lane])
 
 
 @compiled

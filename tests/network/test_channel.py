@@ -11,19 +11,9 @@ from hypothesis import strategies as st
 from khop_env.network import Channel, ChannelMemory, Network, PlainLink, plain_noise
 from khop_env.network.randomness import draw_keys, plain_uniform, round_key, uniform
 from khop_env.physics import Links
-from tests.strategies import SEEDS
+from tests.strategies import NETWORKS, SEEDS
 
 LINKS = Links.of(nx.path_graph(4))
-NETWORKS = st.builds(
-    lambda loss, burst, latency, jitter, period: Network(
-        period, loss, None if burst is None else max(burst, loss[1] / (1.0 - loss[1])), latency, min(jitter, latency[0])
-    ),
-    loss=st.tuples(st.floats(0, 0.45), st.floats(0.45, 0.9)),
-    burst=st.sampled_from([None, 1.0, 5.0, 20.0]),
-    latency=st.tuples(st.floats(0, 0.2), st.floats(0.2, 0.4)),
-    jitter=st.floats(0, 0.2),
-    period=st.sampled_from([0.005, 0.05, 0.1]),
-)
 
 
 def started(network: Network, seeds: list[int], links: Links = LINKS, width: int = 0) -> tuple[Channel, ChannelMemory]:
