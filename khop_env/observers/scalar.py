@@ -14,6 +14,7 @@ from khop_env.observers.solve import LANES, barrier, barriers, eps_near_impulse
 _FEW, _MANY = 8, 100  # iterations from a warm start; between bounds, where bisection alone would take 60
 _SMALL = 1e-6  # in eps: the error after such a step of Newton's method is its square
 _EXACT = 4e-16
+_LONGEST = 4.0
 
 
 @compiled
@@ -104,6 +105,7 @@ def _newton(
         for lane in range(width):
             slope = 0.5 * (1.0 - e[lane] * e[lane])
             step = (e[lane] + weight[lane] * z[lane] - target[lane]) / (slope + weight[lane] / gain[lane])
+            step = min(max(step, -_LONGEST), _LONGEST)  # the exponential is far from linear, and ends at 700
             # a lane that has converged stays: its result mustn't depend on the others
             on = active[lane] > 0.0
             u[lane] -= step if on else 0.0

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import make_law
 from khop_env.network import Network
 from khop_env.observers import (
     ESTIMATORS,
@@ -43,7 +42,7 @@ def excess(simulator: Simulator) -> float:
     return float((error / (bound + 1e-12)).max(initial=0.0))
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     system=systems() | systems(directed=True),
     network=NETWORKS,
@@ -116,7 +115,7 @@ def everything(simulator: Simulator, b: int) -> dict[str, np.ndarray]:
     return {name: values[..., b].copy() for name, values in simulator.state.arrays().items() if name != "drawn"}
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(system=systems(), network=NETWORKS, estimator=st.sampled_from(list(ESTIMATORS)), noise=NOISES)
 def test_a_batch_is_its_single_runs_and_restored_ones_go_on_with_the_same_bits(system, network, estimator, noise):
     observers = Networked(replace(network, noise=noise), estimator)
@@ -172,22 +171,21 @@ def test_what_was_not_delivered_changes_nothing(seed, estimator, loss):
 def test_rounds_converge_to_the_ideal_observers_as_the_period_falls():
     """To order 1: what a neighbour sent is one period old."""
     scenario = paper()
-    law = make_law(scenario.law)
-    states = scenario.design.states.layout
+    u = np.random.default_rng(0).uniform(-2.0, 2.0, scenario.fleet.m)
 
     def estimates(observers, dt: float) -> np.ndarray:
-        simulator = scenario.build(law=law, observers=observers).reset(3)
-        for _ in range(round(2.0 / dt)):
-            simulator.step(dt)
+        simulator = scenario.build(observers=observers).reset(3)
+        for _ in range(round(1.0 / dt)):
+            simulator.step(dt, u)
         return simulator.state.memory.get("ppso.estimate", simulator.state.memory["estimate"])[:, 0]
 
-    ideal = estimates(Proximal(2), 1e-3)
-    assert len(ideal) == states.size
+    ideal = estimates(Proximal(2), 5e-4)
     periods = np.array([0.02, 0.01, 0.005, 0.0025])
-    gaps = [np.abs(estimates(Networked(Network(period=T), "ppso"), T) - ideal).max() for T in periods]
+    gaps = np.array([np.abs(estimates(Networked(Network(period=T), "ppso"), T) - ideal).max() for T in periods])
     order = np.polyfit(np.log(periods), np.log(gaps), 1)[0]
-    print(f"largest distance to the ideal estimates {gaps} at periods {periods.tolist()} s: order {order:.2f}")
-    assert 0.8 < order < 1.4
+    print(f"largest distance to the ideal estimates: {gaps.round(4)} m at {periods} s, order {order:.2f}")
+    assert 0.9 < order < 1.3
+    assert gaps[-1] < 0.02
 
 
 @settings(max_examples=30)
@@ -247,12 +245,11 @@ def test_the_scalar_solve_is_exact_from_any_warm_start(seed, scale, stiffness):
         solve_alone(
             packed, np.arange(pairs + 1), 2 * np.arange(pairs), tau, held, rho, np.ones(batch, bool), warm, y, e
         )
-        assert (np.abs(e) < 1.0).all()
-        with np.errstate(divide="ignore"):
-            z = 2.0 / (1.0 - e**2) * np.log((1.0 + e) / (1.0 - e))
-        inside = np.abs(e) < 1.0 - 1e-6  # nearer to the wall e has too few digits to give z
-        residual = e + tau * z - predictor
-        assert (np.abs(residual) <= 1e-8 * (np.abs(predictor) + np.abs(tau * z)))[inside].all()
+        np.testing.assert_allclose(e, np.tanh(warm / 2.0), atol=1e-11)  # of eps, which is returned in its place
+        for side in (-1.0, 1.0):  # the equation changes its sign within 1e-9 of the solution
+            near = warm + side * 1e-9 * (1.0 + np.abs(warm))
+            excess = np.tanh(near / 2.0) + tau * near * (1.0 + np.cosh(near)) - predictor
+            assert (side * excess >= 0.0).all()
         found.append(y)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-11, atol=1e-12)
 
