@@ -370,7 +370,7 @@ def _positive(value: object, what: str, unit: str) -> float:
 
 
 def _is_index(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
 
 
 def _bounds(value: Span) -> tuple[float, float]:

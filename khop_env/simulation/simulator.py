@@ -24,7 +24,9 @@ from khop_env.observers import (
     Proximal,
     SolveError,
 )
-from khop_env.observers.disagreement import disagreement
+from khop_env.observers.base import LinksNow
+from khop_env.observers.disagreement import disagreement, weighted_disagreement
+from khop_env.observers.weights import WeightsNow
 from khop_env.physics import read_only
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
@@ -345,6 +347,10 @@ class Simulator:
         return inputs
 
     def _disagreement(self, funnels: Funnels, memory: str, source: FloatArray) -> FloatArray:
-        out = np.zeros((funnels.layout.size, self.num_envs))
-        disagreement(funnels.layout.arrays, self.state.memory[memory], source, out)
+        out, estimate = np.zeros((funnels.layout.size, self.num_envs)), self.state.memory[memory]
+        if self.design.schedule is None:
+            disagreement(funnels.layout.arrays, estimate, source, out)
+        else:
+            weights = WeightsNow(funnels.layout, self.num_envs).of(LinksNow(self.design, self.num_envs).up(self.state))
+            weighted_disagreement(funnels.layout.packed, weights, estimate, source, out)
         return out.T
