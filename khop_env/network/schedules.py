@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 import networkx as nx
@@ -69,7 +69,7 @@ class Schedule:
         if schedule is None or isinstance(schedule, Schedule):
             return schedule
         if isinstance(schedule, Mapping):
-            return _from_table(schedule)
+            return from_table(schedule)
         if isinstance(schedule, str) or not isinstance(schedule, Sequence) or not schedule:
             raise ValueError(
                 f"a schedule is a Schedule, a mapping with its 'kind', several of these, or None; got {schedule!r}"
@@ -287,7 +287,8 @@ SCHEDULES: dict[str, type[Schedule]] = {
 """Kinds of schedules in scenario files."""
 
 
-def _from_table(table: Mapping[str, object]) -> Schedule:
+def from_table(table: Mapping[str, object]) -> Schedule:
+    """The schedule in one mapping, as `Schedule.of` reads it."""
     values: dict[str, Any] = dict(table)
     kind = values.pop("kind", None)
     if not isinstance(kind, str) or kind not in SCHEDULES:
@@ -311,7 +312,7 @@ def _from_table(table: Mapping[str, object]) -> Schedule:
     try:
         return make(**values)
     except TypeError:
-        missing = [field.name for field in fields(make) if field.name not in values and field.default is not None]
+        missing = [field.name for field in fields(make) if field.name not in values and field.default is MISSING]
         raise ValueError(f"{make.__name__}: {missing[0]} is missing") from None
 
 

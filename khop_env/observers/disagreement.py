@@ -10,7 +10,7 @@ import numpy as np
 
 from khop_env.compiled import compiled, inlined
 from khop_env.elementary import log_ratio
-from khop_env.observers.layout import FloatArray, PairArrays
+from khop_env.observers.layout import FloatArray, PairArrays, PairLayout
 from khop_env.observers.weights import Weights
 
 
@@ -84,6 +84,16 @@ def weighted_disagreement(
                     other = offset + pairs.entry[k] * n + c
                     for env in range(batch):
                         out[column, env] -= entry[k, env] * estimate[other, env]
+
+
+def disagreement_by(
+    layout: PairLayout, weights: Weights | None, estimate: FloatArray, source: FloatArray, out: FloatArray
+) -> None:
+    """`disagreement` of a layout; `weighted_disagreement` where links come and go."""
+    if weights is None:
+        disagreement(layout.arrays, estimate, source, out)
+    else:
+        weighted_disagreement(layout.packed, weights, estimate, source, out)
 
 
 @compiled

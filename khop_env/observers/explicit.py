@@ -9,8 +9,8 @@ import numpy as np
 
 from khop_env.observers.base import FunnelObservers, LinksNow, Plant, PlantState, weights_at
 from khop_env.observers.design import Funnels, ObserverDesign
-from khop_env.observers.disagreement import correction, disagreement, largest_curvature, weighted_disagreement
-from khop_env.observers.layout import FloatArray, PairLayout
+from khop_env.observers.disagreement import correction, disagreement_by, largest_curvature
+from khop_env.observers.layout import FloatArray
 from khop_env.observers.prediction import Prediction
 from khop_env.observers.weights import Weights
 
@@ -76,7 +76,7 @@ class BatchedRightHandSide:
                 found.input_estimate,
             ),
         ):
-            _disagreement(layout, now, estimate, source, xi)
+            disagreement_by(layout, now, estimate, source, xi)
             correction(layout.arrays, xi, widths, e, rate)
         self._prediction.rate(state.t, memory["estimate"], memory["input_estimate"], self._rate)
         found.estimate[...] += self._rate
@@ -147,7 +147,7 @@ class Explicit(FunnelObservers):
             ("state", self.design.states, of_states, self.rho, memory["estimate"], state.x, self._xi, rate.e),
             ("input", self.design.inputs, of_inputs, self.omega, memory["input_estimate"], state.g, self._mu, rate.q),
         ):
-            _disagreement(funnels.layout, now, estimate, source, xi)
+            disagreement_by(funnels.layout, now, estimate, source, xi)
             ratio = np.abs(xi) / widths.at(state.t)[funnels.layout.column_row]
             if not np.all(ratio < 1.0):
                 raise FunnelError(self._left_funnel(kind, funnels, ratio, e_before, dt, start))
@@ -183,12 +183,3 @@ def _largest(ratio: FloatArray) -> tuple[int, int]:
     """Column and environment of the largest |e|; a NaN counts as the largest."""
     column, env = np.unravel_index(int(np.argmax(np.where(np.isnan(ratio), np.inf, ratio))), ratio.shape)
     return int(column), int(env)
-
-
-def _disagreement(
-    layout: PairLayout, weights: Weights | None, estimate: FloatArray, source: FloatArray, out: FloatArray
-) -> None:
-    if weights is None:
-        disagreement(layout.arrays, estimate, source, out)
-    else:
-        weighted_disagreement(layout.packed, weights, estimate, source, out)

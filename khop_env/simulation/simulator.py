@@ -24,9 +24,8 @@ from khop_env.observers import (
     Proximal,
     SolveError,
 )
-from khop_env.observers.base import LinksNow
-from khop_env.observers.disagreement import disagreement, weighted_disagreement
-from khop_env.observers.weights import WeightsNow
+from khop_env.observers.base import LinksNow, weights_at
+from khop_env.observers.disagreement import disagreement_by
 from khop_env.physics import read_only
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
@@ -347,10 +346,8 @@ class Simulator:
         return inputs
 
     def _disagreement(self, funnels: Funnels, memory: str, source: FloatArray) -> FloatArray:
-        out, estimate = np.zeros((funnels.layout.size, self.num_envs)), self.state.memory[memory]
-        if self.design.schedule is None:
-            disagreement(funnels.layout.arrays, estimate, source, out)
-        else:
-            weights = WeightsNow(funnels.layout, self.num_envs).of(LinksNow(self.design, self.num_envs).up(self.state))
-            weighted_disagreement(funnels.layout.packed, weights, estimate, source, out)
+        links = None if self.design.schedule is None else LinksNow(self.design, self.num_envs)
+        weights = weights_at(links, self.state)[funnels is self.design.inputs]
+        out = np.zeros((funnels.layout.size, self.num_envs))
+        disagreement_by(funnels.layout, weights, self.state.memory[memory], source, out)
         return out.T

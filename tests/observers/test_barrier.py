@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from khop_env.observers.barrier import _barrier, eps_near_impulse
 from khop_env.observers.disagreement import barrier_curvature, correction, transformation, transformation_slope
 from khop_env.observers.layout import PairLayout
-from khop_env.observers.barrier import _barrier, eps_near_impulse
 from khop_env.physics import Links, k_hop_neighbors
 
 mpmath.mp.dps = 60
