@@ -229,9 +229,11 @@ class TestAPathThatBreaks:
 
     def test_an_explicit_step_reports_the_jump(self):
         simulator = path_simulator(self.SCHEDULE, Explicit())
-        simulator.state.t[...] = 2.0 - 3e-5  # the link comes back while the estimate is off by more than rho
-        simulator.state.x[0] = 1.0
-        simulator.state.memory["estimate"][simulator.design.states.layout.slot[2, 0]] = 1.0
+        layout, state = simulator.design.states.layout, simulator.state
+        state.t[...] = 2.0 - 3e-5
+        state.memory["estimate"][...] = state.x[layout.column_source]
+        for observer in (3, 4):  # cut off, and far off when the link comes back
+            state.memory["estimate"][layout.slot[observer, 0]] += 1.0
         simulator.step(1e-5)
         simulator.step(1e-5)
         simulator.step(1e-5)
