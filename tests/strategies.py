@@ -5,6 +5,8 @@ The paper's definitions are written out here once more, from the graph alone (ne
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import dataclass
 from typing import get_args
 
@@ -12,7 +14,7 @@ import networkx as nx
 import numpy as np
 from hypothesis import strategies as st
 
-from khop_env.network import Network
+from khop_env.network import Fixed, Network, Outage, RandomLinks, Range, Schedule, Switching
 from khop_env.observers import DesignRule, Exponential, Funnels, ObserverDesign, Observers, PairLayout, TargetObservers
 from khop_env.physics import (
     BandLimitedNoise,
@@ -124,6 +126,39 @@ def hops(draw: st.DrawFn, relay: bool | None = None) -> tuple[int, bool]:
     """k and whether neighbours relay; all k that leave something to estimate."""
     relay = draw(st.booleans()) if relay is None else relay
     return draw(st.integers(2 if relay else 1, 4)), relay
+
+
+@st.composite
+def schedules(draw: st.DrawFn, graph: nx.Graph) -> Schedule:
+    """One to three schedules of a graph's links, of all kinds, joined."""
+
+    def some_links() -> nx.Graph:
+        part = nx.empty_graph(len(graph), create_using=type(graph))
+        part.add_edges_from(edge for edge in graph.edges if draw(st.booleans()))
+        return part
+
+    period = draw(st.floats(np.log(0.05), np.log(20.0)).map(lambda exponent: float(np.exp(exponent))))
+    share = st.floats(0.0, 1.0)
+    chosen = []
+    for kind in draw(st.lists(st.sampled_from(["fixed", "switching", "random", "range", "outage"]), max_size=3)):
+        if kind == "fixed":
+            chosen.append(Fixed(some_links()))
+        elif kind == "switching":
+            graphs = tuple(some_links() for _ in range(draw(st.integers(1, 4))))
+            times = tuple(period * i for i in range(len(graphs)))
+            chosen.append(Switching(graphs, period) if draw(st.booleans()) else Switching(graphs, None, times))
+        elif kind == "random":
+            both, low = draw(st.booleans()), draw(share)
+            connected = both and not graph.is_directed() and draw(st.booleans())
+            chosen.append(RandomLinks((low, draw(st.floats(low, 1.0))), both, connected))
+        elif kind == "range":
+            chosen.append(Range(draw(st.floats(0.3, 6.0))))
+        else:
+            where = draw(st.sampled_from(["agent", "link", "drawn"]))
+            agent = draw(st.integers(0, len(graph) - 1)) if where == "agent" else None
+            link = draw(st.sampled_from(sorted(graph.edges))) if where == "link" else None
+            chosen.append(Outage((0.0, period), (0.0, period), agent, link))
+    return functools.reduce(operator.and_, chosen or [Fixed()])
 
 
 def exponentials(smallest: float = 1e-3, largest: float = 1e3) -> st.SearchStrategy[Exponential]:

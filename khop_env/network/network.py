@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
-from khop_env.network.reading import Range, number, number_or_range, parsed
+from khop_env.network.reading import Span, number, number_or_range, parsed
 from khop_env.physics import did_you_mean
 
 MOST_ROUNDS_LATE = 4096
@@ -37,9 +37,9 @@ class Network:
     """
 
     period: float = 0.05
-    loss: Range = 0.0
+    loss: Span = 0.0
     burst: float | None = None
-    latency: Range = 0.0
+    latency: Span = 0.0
     jitter: float = 0.0
     noise: float = 0.0
 

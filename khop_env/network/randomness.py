@@ -17,6 +17,7 @@ from khop_env.compiled import inlined
 
 LOSS, DELAY, NOISE, EPISODE = 0, 1, 2, 3  # purposes of a number: 4 of each link and round
 EPISODE_ROUND = -1  # before the first round: numbers of the whole episode
+SCHEDULE_ROUND = -2  # likewise, of the schedules of links
 
 _STEP = 0x9E3779B97F4A7C15
 _FIRST = 0xBF58476D1CE4E5B9
@@ -34,7 +35,7 @@ def mixed(z: np.uint64) -> np.uint64:
 
 @inlined
 def round_key(key: np.uint64, number: int) -> np.uint64:
-    """The key of a round, from -1, of an environment."""
+    """The key of a round, from -2, of an environment."""
     return mixed(key + np.uint64(_STEP) * np.uint64(number + 2))
 
 

@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-Range: TypeAlias = float | tuple[float, float]
+Span: TypeAlias = float | tuple[float, float]
 
 
 def split_networks(text: str) -> list[str]:
@@ -31,7 +31,7 @@ def split_networks(text: str) -> list[str]:
     return found
 
 
-def parsed(text: str, what: str) -> Range | None:
+def parsed(text: str, what: str) -> Span | None:
     """A number, a range "low..high", or "none"; `what` it is, for error messages.
 
     Raises:
@@ -59,7 +59,7 @@ def number(value: object, what: str) -> float:
     return float(value)
 
 
-def number_or_range(value: object, what: str) -> Range:
+def number_or_range(value: object, what: str) -> Span:
     """A value that is a number or a pair (low, high), lists included; `what` it is, for error messages.
 
     Raises:

@@ -24,6 +24,7 @@ import networkx as nx
 import numpy as np
 
 from khop_env.brief import brief
+from khop_env.network import Activity, Fixed, Schedule
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.observers.performance import FunnelBank, PerformanceFunction, scaled
 from khop_env.physics import Fleet, Links, k_hop_neighbors, one_way_links, validate_graph
@@ -176,6 +177,8 @@ class ObserverDesign:
             where the input map depends on the state.
         design_rule: from delta to the funnels, "paper" or "sharp"; by default the paper's, or the sharp one where links
             go one way and the paper's, which needs symmetric matrices, doesn't apply.
+        schedule: which links are up, and when; None for all of them, always. The graph has all that may ever be up: it
+            says who observes whom, and gives the funnels.
 
     Attributes:
         links: the directed links of the graph.
@@ -187,7 +190,8 @@ class ObserverDesign:
     Raises:
         DesignError: the paper's design rule where links go one way, an input observer for an agent whose g depends on
             its state, none for an agent whose g is unbounded, or a bound that is missing or of a wrong length.
-        ValueError: a graph that isn't connected and labelled 0..N-1, or an unknown design rule.
+        ValueError: a graph that isn't connected and labelled 0..N-1, an unknown design rule, or a schedule with links
+            that the graph doesn't have.
     """
 
     fleet: Fleet
@@ -198,6 +202,7 @@ class ObserverDesign:
     relay: bool = True
     targets: Sequence[TargetObservers] | None = None
     design_rule: DesignRule | None = None
+    schedule: Schedule | None = None
     links: Links = field(init=False)
     neighborhoods: tuple[tuple[int, ...], ...] = field(init=False)
     options: tuple[TargetObservers, ...] = field(init=False)
@@ -238,7 +243,13 @@ class ObserverDesign:
                 f"{fleet.ids[observed_inputs[0]]!r}; give a bound theta or set input_observer=False"
             )
         lay_out = functools.partial(
-            PairLayout.build, links, neighborhoods, dimensions, fleet.state_offset, relay=self.relay
+            PairLayout.build,
+            links,
+            neighborhoods,
+            dimensions,
+            fleet.state_offset,
+            relay=self.relay,
+            changing=self.schedule is not None,
         )
         states, inputs = lay_out(), lay_out(targets=observed_inputs)
         values = {
@@ -251,6 +262,11 @@ class ObserverDesign:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
+        self.activity()  # raises for a schedule that doesn't fit the graph
+
+    def activity(self) -> Activity:
+        """The schedule on this graph's links; all links up, always, without one."""
+        return (self.schedule or Fixed()).bind(self.links, self.fleet.position_index)
 
     @cached_property
     def knowledge(self) -> PairLayout:
@@ -261,7 +277,8 @@ class ObserverDesign:
 
     def __str__(self) -> str:
         pairs = f"{self.states.layout.pairs} state and {self.inputs.layout.pairs} input observers"
-        return f"{self.fleet}; k={self.k}{'' if self.relay else ', no relays'}, {pairs}"
+        changing = "" if self.schedule is None else ", changing links"
+        return f"{self.fleet}; k={self.k}{'' if self.relay else ', no relays'}{changing}, {pairs}"
 
     def __repr__(self) -> str:
         return f"ObserverDesign({self})"

@@ -10,7 +10,8 @@ import numpy as np
 
 from khop_env.compiled import compiled, inlined
 from khop_env.elementary import log_ratio
-from khop_env.observers.layout import FloatArray, PairArrays
+from khop_env.observers.layout import FloatArray, PairArrays, PairLayout
+from khop_env.observers.weights import Weights
 
 
 @inlined
@@ -60,6 +61,39 @@ def disagreement(pairs: PairArrays, estimate: FloatArray, source: FloatArray, ou
                     other = offset + pairs.entry[k] * n + c
                     for env in range(batch):
                         out[column, env] -= estimate[other, env]
+
+
+@compiled
+def weighted_disagreement(
+    pairs: PairArrays, weights: Weights, estimate: FloatArray, source: FloatArray, out: FloatArray
+) -> None:
+    """`disagreement` for links that come and go, `WeightsNow.of`; 0 for observers that are cut off."""
+    pairs = PairArrays(*pairs)
+    diagonal, relay, entry = weights
+    batch = estimate.shape[1]
+    for t in range(pairs.observers.size):
+        eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
+        offset, origin = pairs.column[t], pairs.source[t]
+        for a in range(eta):
+            for c in range(n):
+                column = offset + a * n + c
+                for env in range(batch):
+                    own = diagonal[pair + a, env] * estimate[column, env]
+                    out[column, env] = own - relay[pair + a, env] * source[origin + c, env]
+                for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
+                    other = offset + pairs.entry[k] * n + c
+                    for env in range(batch):
+                        out[column, env] -= entry[k, env] * estimate[other, env]
+
+
+def disagreement_by(
+    layout: PairLayout, weights: Weights | None, estimate: FloatArray, source: FloatArray, out: FloatArray
+) -> None:
+    """`disagreement` of a layout; `weighted_disagreement` where links come and go."""
+    if weights is None:
+        disagreement(layout.arrays, estimate, source, out)
+    else:
+        weighted_disagreement(layout.packed, weights, estimate, source, out)
 
 
 @compiled
@@ -147,3 +181,33 @@ def largest_ratios(
                     ratio = ratio if ratio < np.inf else np.inf  # a NaN must not pass as small
                     normalized[env] = max(normalized[env], ratio)
                     relative[env] = max(relative[env], error)
+
+
+@compiled
+def largest_weighted_ratios(
+    pairs: PairArrays,
+    weights: Weights,
+    estimate: FloatArray,
+    source: FloatArray,
+    rho: FloatArray,
+    inverse_row_sums: FloatArray,
+    normalized: FloatArray,
+    relative: FloatArray,
+) -> None:
+    """`largest_ratios` for links that come and go: `WeightsNow.of` and its (pairs, B) `inverse_row_sums`."""
+    pairs = PairArrays(*pairs)
+    xi = np.empty(estimate.shape)
+    weighted_disagreement(pairs, weights, estimate, source, xi)
+    for t in range(pairs.observers.size):
+        eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
+        offset, origin, row = pairs.column[t], pairs.source[t], pairs.row[t]
+        for a in range(eta):
+            for c in range(n):
+                column = offset + a * n + c
+                for env in range(estimate.shape[1]):
+                    scale = 1.0 / rho[row + c, env]
+                    ratio = abs(xi[column, env]) * scale
+                    error = abs(estimate[column, env] - source[origin + c, env]) * scale
+                    ratio = ratio if ratio < np.inf else np.inf  # a NaN must not pass as small
+                    normalized[env] = max(normalized[env], ratio)
+                    relative[env] = max(relative[env], error / inverse_row_sums[pair + a, env])

@@ -7,11 +7,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from khop_env.observers.base import Assumptions, FunnelObservers, Plant, PlantState
+from khop_env.observers.base import Assumptions, FunnelObservers, LinksNow, Plant, PlantState, weights_at
 from khop_env.observers.design import Funnels, ObserverDesign
-from khop_env.observers.disagreement import correction, disagreement, largest_curvature
+from khop_env.observers.disagreement import correction, disagreement_by, largest_curvature
 from khop_env.observers.layout import FloatArray
 from khop_env.observers.prediction import Prediction
+from khop_env.observers.weights import Weights
 
 
 class FunnelError(RuntimeError):
@@ -56,15 +57,26 @@ class BatchedRightHandSide:
         sizes = (*self._layouts, *self._layouts)
         self._derivative = Derivative(*(np.zeros((layout.size, num_envs)) for layout in sizes))
         self._prediction, self._rate = Prediction(design, num_envs), np.zeros_like(self._xi)
+        self._links = None if design.schedule is None else LinksNow(design, num_envs)
 
     def __call__(self, state: PlantState, rho: FloatArray, omega: FloatArray) -> Derivative:
         """See `RightHandSide`."""
         found, memory = self._derivative, state.memory
-        for layout, estimate, source, widths, xi, e, rate in (
-            (self._layouts[0], memory["estimate"], state.x, rho, self._xi, found.e, found.estimate),
-            (self._layouts[1], memory["input_estimate"], state.g, omega, self._mu, found.q, found.input_estimate),
+        weights = weights_at(self._links, state)
+        for layout, now, estimate, source, widths, xi, e, rate in (
+            (self._layouts[0], weights[0], memory["estimate"], state.x, rho, self._xi, found.e, found.estimate),
+            (
+                self._layouts[1],
+                weights[1],
+                memory["input_estimate"],
+                state.g,
+                omega,
+                self._mu,
+                found.q,
+                found.input_estimate,
+            ),
         ):
-            disagreement(layout.arrays, estimate, source, xi)
+            disagreement_by(layout, now, estimate, source, xi)
             correction(layout.arrays, xi, widths, e, rate)
         self._prediction.rate(state.t, memory["estimate"], memory["input_estimate"], self._rate)
         found.estimate[...] += self._rate
@@ -73,6 +85,8 @@ class BatchedRightHandSide:
 
 class Explicit(FunnelObservers):
     """Forward Euler, with which the paper samples its example; needs steps of about 1e-5 s.
+
+    It follows a schedule of links as long as no change puts a disagreement outside its funnel.
 
     Args:
         right_hand_side: builds the observers' derivative from a design and a number of environments; batched by
@@ -102,6 +116,7 @@ class Explicit(FunnelObservers):
             SolveError: if a state isn't finite.
         """
         rate = self._derivative(state, self.rho.at(state.t), self.omega.at(state.t))
+        weights = weights_at(self.links, state)  # of this step: links that change at its end are the next one's
         for kind, funnels, normalized in (("state", self.design.states, rate.e), ("input", self.design.inputs, rate.q)):
             ratio = np.abs(normalized)
             if not np.all(ratio < 1.0):
@@ -109,22 +124,30 @@ class Explicit(FunnelObservers):
                 raise FunnelError(
                     f"the {kind} observer of {self._name(funnels, column, env)} is outside its funnel before the step, "
                     f"at {ratio[column, env]:.4g} times its width: the "
-                    f"{'state' if kind == 'state' else 'input (Assumption 2-ii)'} jumped. No explicit step can go on "
+                    f"{'state' if kind == 'state' else 'input (Assumption 2-ii)'} jumped"
+                    f"{'' if self.links is None else ', or links went or came'}. No explicit step can go on "
                     "from there; the proximal step can"
                 )
         plant.stage(0, np.array([dt]), dt, before, state)
         state.memory["estimate"] += dt * rate.estimate
         state.memory["input_estimate"] += dt * rate.input_estimate
         plant.actuate(state)
-        self._require_inside(before.t, state, dt, rate)
+        self._require_inside(before.t, state, dt, rate, weights)
 
-    def _require_inside(self, start: FloatArray, state: PlantState, dt: float, rate: Derivative) -> None:
-        memory = state.memory
-        for kind, funnels, widths, estimate, source, xi, e_before in (
-            ("state", self.design.states, self.rho, memory["estimate"], state.x, self._xi, rate.e),
-            ("input", self.design.inputs, self.omega, memory["input_estimate"], state.g, self._mu, rate.q),
+    def _require_inside(
+        self,
+        start: FloatArray,
+        state: PlantState,
+        dt: float,
+        rate: Derivative,
+        weights: tuple[Weights | None, Weights | None],
+    ) -> None:
+        memory, (of_states, of_inputs) = state.memory, weights
+        for kind, funnels, now, widths, estimate, source, xi, e_before in (
+            ("state", self.design.states, of_states, self.rho, memory["estimate"], state.x, self._xi, rate.e),
+            ("input", self.design.inputs, of_inputs, self.omega, memory["input_estimate"], state.g, self._mu, rate.q),
         ):
-            disagreement(funnels.layout.arrays, estimate, source, xi)
+            disagreement_by(funnels.layout, now, estimate, source, xi)
             ratio = np.abs(xi) / widths.at(state.t)[funnels.layout.column_row]
             if not np.all(ratio < 1.0):
                 raise FunnelError(self._left_funnel(kind, funnels, ratio, e_before, dt, start))

@@ -41,7 +41,8 @@ class PairArrays(NamedTuple):
         entry: (entries,) places within the target of the observers whose estimates the observer receives: the
             off-diagonal -1 entries of M_i.
         first: (pairs,) place of the first non-zero of each row of M_i (its lower profile).
-        last: (pairs,) place of the last non-zero of each row of M_i's factor U; empty if all links go both ways.
+        last: (pairs,) place of the last non-zero of each row of M_i's factor U; empty if all links go both ways and
+            never change, so that M_i is symmetric.
     """
 
     observers: IntArray
@@ -120,6 +121,7 @@ class PairLayout:
         *,
         relay: bool,
         targets: Iterable[int] | None = None,
+        changing: bool = False,
     ) -> PairLayout:
         """Lay out the observers of `targets`.
 
@@ -130,6 +132,7 @@ class PairLayout:
             offsets: per agent where its components start in the fleet's flat vector.
             relay: whether neighbours relay the target's state (the paper's Assumption 4).
             targets: agents to observe; all by default.
+            changing: whether links come and go.
         """
         senders = links.senders
         blocks: list[tuple[int, ...]] = []
@@ -165,7 +168,7 @@ class PairLayout:
                 entry_link.extend(links.index[members[b], agent] for b in linked)
                 relay_link.extend(links.index[p, agent] for p in relays)
                 relay_start.append(len(relay_link))
-                if not links.symmetric:
+                if changing or not links.symmetric:
                     begin = len(last) - a
                     last.append(max([a, *linked, *last[begin + first[-1] : begin + a]]))
             size += len(members) * dimensions[i]

@@ -6,12 +6,12 @@ A slow and simple reference for the batched right-hand side, which shows that th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from khop_env.observers.base import PlantState
+from khop_env.observers.base import LinksNow, PlantState
 from khop_env.observers.design import Funnels, ObserverDesign
 from khop_env.observers.explicit import Derivative
 from khop_env.observers.layout import FloatArray
@@ -27,7 +27,7 @@ class Message:
         state: its own x_i, (n_i,).
         input_map: its own g_i(u_i), (n_i,).
         relayed: under the relay assumption, x and g of each of its neighbours, which it measures.
-        estimates: its estimate of each of its targets' states.
+        estimates: its estimate of each of the targets' states that reach it.
         input_estimates: likewise of their input maps.
     """
 
@@ -36,6 +36,14 @@ class Message:
     relayed: Mapping[int, tuple[FloatArray, FloatArray]]
     estimates: Mapping[int, FloatArray]
     input_estimates: Mapping[int, FloatArray]
+
+    def knows(self, i: int, sender: int) -> bool:
+        """Whether the true state of `i` is in this message of `sender`."""
+        return i == sender or i in self.relayed
+
+    def truth(self, i: int, sender: int) -> tuple[FloatArray, FloatArray]:
+        """x_i and g_i(u_i) in this message of `sender`."""
+        return (self.state, self.input_map) if i == sender else self.relayed[i]
 
 
 @dataclass
@@ -74,16 +82,35 @@ class ObserverAgent:
     def __init__(self, index: int, targets: dict[int, HeldEstimate]) -> None:
         self.index, self.targets = index, targets
 
+    def reached(self, i: int, inbox: Mapping[int, Message]) -> bool:
+        """Whether target `i` reaches this agent: a neighbour sends its true state, or an estimate of it."""
+        target = self.targets[i]
+        return any(inbox[p].knows(i, p) for p in target.relays if p in inbox) or any(
+            i in inbox[p].estimates for p in target.peers if p in inbox
+        )
+
     def message(
-        self, state: FloatArray, input_map: FloatArray, measured: Mapping[int, tuple[FloatArray, FloatArray]]
+        self,
+        state: FloatArray,
+        input_map: FloatArray,
+        measured: Mapping[int, tuple[FloatArray, FloatArray]],
+        known: Collection[int],
     ) -> Message:
-        """The message to its neighbours: its own state and input, measurements of its neighbours, and its estimates."""
+        """The message to its neighbours: its own state and input, measurements of its neighbours, and its estimates.
+
+        Args:
+            state: its own.
+            input_map: its own.
+            measured: states and input maps of its neighbours.
+            known: the targets that reach it; of others it knows nothing new, and sends nothing.
+        """
+        targets = {i: target for i, target in self.targets.items() if i in known}
         return Message(
             state,
             input_map,
             measured,
-            {i: target.estimate for i, target in self.targets.items()},
-            {i: target.input_estimate for i, target in self.targets.items() if target.omega is not None},
+            {i: target.estimate for i, target in targets.items()},
+            {i: target.input_estimate for i, target in targets.items() if target.omega is not None},
         )
 
     def derivative(self, t: float, i: int, inbox: Mapping[int, Message]) -> tuple[FloatArray, ...]:
@@ -92,14 +119,15 @@ class ObserverAgent:
         Without an input observer of that target the second and the fourth are empty.
         """
         target = self.targets[i]
-        relayed = [inbox[p].relayed.get(i, (inbox[p].state, inbox[p].input_map)) for p in target.relays]
-        others = [inbox[p].estimates[i] for p in target.peers] + [state for state, _ in relayed]
+        relayed = [inbox[p].truth(i, p) for p in target.relays if p in inbox and inbox[p].knows(i, p)]
+        peers = [p for p in target.peers if p in inbox and i in inbox[p].estimates]
+        others = [inbox[p].estimates[i] for p in peers] + [state for state, _ in relayed]
         rate, e = _correction(t, _disagreement(target.estimate, others), target.rho)
         if target.drift_known:
             rate = rate + target.model.drift(np.array([t]), target.estimate[None])[0]
         if target.omega is None:
             return rate, np.zeros(0), e, np.zeros(0)
-        others = [inbox[p].input_estimates[i] for p in target.peers] + [input_map for _, input_map in relayed]
+        others = [inbox[p].input_estimates[i] for p in peers] + [input_map for _, input_map in relayed]
         input_rate, q = _correction(t, _disagreement(target.input_estimate, others), target.omega)
         return rate + target.input_estimate, input_rate, e, q
 
@@ -129,6 +157,7 @@ class MessagePassing:
 
     def __init__(self, design: ObserverDesign, num_envs: int) -> None:
         self._design, senders = design, design.links.senders
+        self._links = None if design.schedule is None else LinksNow(design, num_envs)
         rho = _per_target(design.states)
         omega = _per_target(design.inputs)
         self.agents: list[ObserverAgent] = []
@@ -150,11 +179,18 @@ class MessagePassing:
         """See `RightHandSide`."""
         estimate, input_estimate = state.memory["estimate"], state.memory["input_estimate"]
         found = Derivative(*(np.zeros_like(values) for values in (estimate, input_estimate) * 2))
+        links = self._design.links
         for env in range(state.t.size):
-            self._in_one_environment(state, env, found)
+            senders: Sequence[Collection[int]] = links.senders
+            if self._links is not None:
+                up = self._links.up(state)[:, env]
+                senders = [links.sender[up & (links.receiver == a)].tolist() for a in range(links.agents)]
+            self._in_one_environment(state, env, senders, found)
         return found
 
-    def _in_one_environment(self, state: PlantState, env: int, found: Derivative) -> None:
+    def _in_one_environment(
+        self, state: PlantState, env: int, senders: Sequence[Collection[int]], found: Derivative
+    ) -> None:
         design, fleet, memory = self._design, self._design.fleet, state.memory
         slot, input_slot = design.states.layout.slot, design.inputs.layout.slot
         for agent in self.agents:
@@ -166,13 +202,16 @@ class MessagePassing:
                     target.input_estimate = memory["input_estimate"][at : at + n, env]
 
         own = [(state.x[fleet.state_slice(i), env], state.g[fleet.state_slice(i), env]) for i in range(len(fleet))]
-        senders = design.links.senders
-        sent = [
-            agent.message(*own[agent.index], {j: own[j] for j in senders[agent.index]} if design.relay else {})
-            for agent in self.agents
-        ]
+        measured = [{j: own[j] for j in senders[a]} if design.relay else {} for a in range(len(fleet))]
+        known: list[set[int]] = [set() for _ in self.agents]
+        spreading = True
+        while spreading:  # exchange takes no time: until no target reaches one more agent
+            sent = [a.message(*own[a.index], measured[a.index], known[a.index]) for a in self.agents]
+            inboxes = [{j: sent[j] for j in senders[a.index]} for a in self.agents]
+            reached = [{i for i in a.targets if a.reached(i, inboxes[a.index])} for a in self.agents]
+            spreading, known = reached != known, reached
         for agent in self.agents:
-            inbox = {j: sent[j] for j in senders[agent.index]}
+            inbox = inboxes[agent.index]
             for i, target in agent.targets.items():
                 rate, input_rate, normalized, input_normalized = agent.derivative(float(state.t[env]), i, inbox)
                 at, n = slot[agent.index, i], target.model.n

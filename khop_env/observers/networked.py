@@ -86,6 +86,8 @@ class Networked:
         shared = 1 + fleet.n + 2 * (layout.size + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
+        self._activity = None if design.schedule is None else design.activity()
+        self._up = np.ones((len(design.links), num_envs), np.bool_)
         self._lag = np.zeros((layout.pairs, num_envs))
         self._dt = self.longest_step
         self._fastest = self._fewest_rounds()
@@ -156,6 +158,12 @@ class Networked:
         np.copyto(out, state.memory["bound"])
         return Certified(out, "certificate")
 
+    def links_up(self, state: PlantState) -> NDArray[np.bool_] | None:
+        """(L, B) whether each link of the design is up, overwritten by the next call; None where all are, always."""
+        if self._activity is None:
+            return None
+        return self._activity.up(state.memory[_CHANNEL + "key"], state.t, state.x, self._up)
+
     def information(self, state: PlantState) -> Information:
         """Age, way and time of arrival of the newest state that each pair has received."""
         stamp, arrived = state.memory["stamp"], state.memory["arrived"]
@@ -197,13 +205,15 @@ class Networked:
         return {name[len(_CHANNEL) :]: values for name, values in memory.items() if name.startswith(_CHANNEL)}
 
     def _begin_round(self, state: PlantState, due: NDArray[np.bool_]) -> None:
-        """Decide what is lost and what arrives."""
-        self.channel.begin_round(self._of_channel(state.memory), None, due)
+        """Measure what is to be sent, and decide what is lost and what arrives."""
+        channel = self._of_channel(state.memory)
+        self._measured = self.channel.measured(channel, state.x)
+        self.channel.begin_round(channel, self.links_up(state), due)
 
     def _send(self, state: PlantState, due: NDArray[np.bool_]) -> None:
         """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived."""
         memory, channel = state.memory, self._of_channel(state.memory)
-        shared = [state.t[None], self.channel.measured(channel, state.x)]
+        shared = [state.t[None], self._measured]
         shared += [memory[name] for name in ("center", "error", "stamp", "hops")]
         self.channel.send(channel, [*shared, *self.estimator.message(state)], due)
         if not self.network.fewest_rounds_late:

@@ -70,7 +70,7 @@ def newton_step(
 
 
 @compiled
-def newton_step_one_way(
+def newton_step_weighted(
     eta: int,
     pair: int,
     lanes: int,
@@ -88,27 +88,33 @@ def newton_step_one_way(
     pivot: FloatArray,
     multiplier: FloatArray,
     upper: FloatArray,
+    weight: FloatArray,
 ) -> None:
-    """`newton_step` for an M that isn't symmetric, by LU in its profile; row a of U is upper[a eta : (a + 1) eta]."""
+    """`newton_step` for an M that isn't symmetric, or another one in each lane: by LU in its profile.
+
+    Row a of U is upper[a eta : (a + 1) eta]. M's diagonal is `diagonal` (eta, lanes); off it M has minus the entries of
+    `weight` (entries of the target, lanes).
+    """
+    origin = entry_start[pair]
     for a in range(eta):
-        d, begin, end, row = diagonal[pair + a], first[pair + a], last[pair + a], a * eta
+        begin, end, row = first[pair + a], last[pair + a], a * eta
         for lane in range(lanes):
-            dz[a, lane] = d * z[a, lane]
+            dz[a, lane] = diagonal[a, lane] * z[a, lane]
         for j in range(begin, end + 1):
             at = place(row + j)
             for lane in range(lanes):
                 upper[at, lane] = 0.0
         for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
-            other = entry_of[k]
+            other, from_it = entry_of[k], place(k - origin)
             at = place(row + other)
             for lane in range(lanes):
-                dz[a, lane] -= z[other, lane]
-                upper[at, lane] = -scale[lane]
+                dz[a, lane] -= weight[from_it, lane] * z[other, lane]
+                upper[at, lane] = -scale[lane] * weight[from_it, lane]
         at = place(row + a)
         for lane in range(lanes):
             normalized = e[a, lane]
             dz[a, lane] = b[a, lane] - normalized - scale[lane] * dz[a, lane]
-            upper[at, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * d
+            upper[at, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * diagonal[a, lane]
         for k in range(begin, a):
             at = place(row + k)
             for lane in range(lanes):

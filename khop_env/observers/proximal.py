@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from khop_env.elementary import weighted_sum
-from khop_env.observers.base import Assumptions, FunnelObservers, Memory, Plant, PlantState, SolveError
+from khop_env.observers.base import Assumptions, FunnelObservers, Memory, Plant, PlantState, SolveError, weights_at
 from khop_env.observers.design import Funnels, ObserverDesign
 from khop_env.observers.layout import FloatArray
 from khop_env.observers.prediction import Prediction
@@ -111,14 +111,16 @@ class Proximal(FunnelObservers):
             if s:
                 weighted_sum(estimate, implicit[:s], self._slopes[:s], estimate)
             rho = self.rho.at(state.t)
-            found = self._solve_states(tau, estimate, state.x, rho, memory["eps"], self._slopes[s])
+            of_states, of_inputs = weights_at(self.links, state)
+            found = self._solve_states(tau, estimate, state.x, rho, memory["eps"], self._slopes[s], of_states)
             self._account(found, self.design.states, state.x, rho)
             plant.actuate(state)
             if self.design.inputs.layout.size:
                 if s:
                     weighted_sum(last["input_estimate"], implicit[:s], self._input_slopes[:s], input_estimate)
                 omega = self.omega.at(state.t)
-                found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], self._input_slopes[s])
+                slope = self._input_slopes[s]
+                found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], slope, of_inputs)
                 self._account(found, self.design.inputs, state.g, omega)
 
     def _weights_of(self, dt: float) -> list[tuple[FloatArray, FloatArray, float]]:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.compiled import compiled, place
+from khop_env.observers.barrier import barrier, barriers, eps_near_impulse
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays
-from khop_env.observers.solve import LANES, barrier, barriers, eps_near_impulse
+from khop_env.observers.solve import LANES
 
 _FEW, _MANY = 8, 100  # iterations from a warm start; between bounds, where bisection alone would take 60
 _SMALL = 1e-6  # in eps: the error after such a step of Newton's method is its square

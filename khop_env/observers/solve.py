@@ -15,8 +15,8 @@ Written in the impulse z = phi'(e) and with b = P^-1 (M y* - h x_i), s = tau / r
 where e(z) is increasing and bounded with slope in (0, 1/4]. Newton's matrix diag(de/dz) + s M is symmetric positive
 definite with M's sparsity, and never singular. Where links go one way M isn't symmetric, but a row-wise diagonally
 dominant M-matrix: there is still exactly one solution (docs/theory_graphs.md), and Newton's matrix is factorised by LU,
-which needs no pivoting. The unknown that is carried is eps = T(e): any real number, so no step
-can leave the funnel, and no digits are lost at its wall.
+which needs no pivoting; likewise where links come and go, and M differs between environments. The unknown that is
+carried is eps = T(e): any real number, so no step can leave the funnel, and no digits are lost at its wall.
 
 A last step is linear in z, and e(z) + s M z = b then holds to rounding however small the step was: the disagreement
 of the returned estimates is rho e, whatever the tolerance.
@@ -24,133 +24,18 @@ of the returned estimates is rho e, whatever the tolerance.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from khop_env.compiled import compiled, inlined, place
-from khop_env.elementary import expm1, log
+from khop_env.compiled import compiled, place
+from khop_env.observers.barrier import LONG_STEP, barriers, land, start_anew, start_anew_weighted
 from khop_env.observers.layout import FloatArray, PairArrays
-from khop_env.observers.newton import newton_step, newton_step_one_way
+from khop_env.observers.newton import newton_step, newton_step_weighted
+from khop_env.observers.weights import Weights
 
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
 MAX_ITERATIONS = 200
+DAMPED = 32  # after so many steps come as many halved ones: they end the cycles of a few problems in a million
 LANES = 64  # scalar problems solved side by side: enough to fill vector registers, few enough to stay in cache
-_JUMP = 0.25  # in eps: beyond it a warm start is no better than a new start
-_LONG_STEP = 1.0  # in eps: beyond it exp is not nearly linear
-
-
-@inlined
-def barrier(eps: float) -> tuple[float, float, float]:
-    """(e, z, d eps / dz) with e = tanh(eps / 2) and z = phi'(e) = eps (1 + cosh eps); de/dz = de/deps d eps/dz."""
-    a = abs(eps)
-    growth = expm1(a)
-    half = 1.0 / (growth + 2.0)
-    e = growth * half
-    q = 2.0 * (growth + 1.0) * half * half  # 1 / (1 + cosh eps) = (1 - e^2) / 2
-    slope = 1.0 + a * e
-    inverse = 1.0 / (q * slope)
-    return math.copysign(e, eps), eps * (slope * inverse), q * q * inverse
-
-
-@inlined
-def eps_near_impulse(z: float) -> float:
-    """Invert z = eps (1 + cosh eps) to a relative 7e-3, for |z| up to 1e300: near enough to start Newton's method.
-
-    For large |z| it is Lambert's W of 2 |z|, started as R. Iacono and J. P. Boyd do (2017), for small ones z / 2; then
-    one step of Newton's method in logarithms, where the function is increasing and nearly straight.
-    """
-    target = min(abs(z), 1e300) + 1e-300
-    growth = log(1.0 + 2.0 * target)
-    lambert = growth * (1.0 - log(1.0 + growth) / (2.0 + growth))
-    a = 0.5 * target if target < 0.5 else min(0.5 * target, lambert)
-    e, value, _ = barrier(a)
-    a -= 2.0 * a * (value - target) / ((value + target) * (1.0 + a * e))
-    return math.copysign(a, z)
-
-
-@compiled
-def barriers(rows: int, lanes: int, stride: int, u: FloatArray, e: FloatArray, z: FloatArray, gain: FloatArray) -> None:
-    """The barrier at `lanes` entries of each row of flat arrays, in one long loop where nothing lies between rows."""
-    if lanes == stride:
-        for q in range(rows * lanes):
-            e[q], z[q], gain[q] = barrier(u[q])
-    else:
-        for a in range(rows):
-            for lane in range(lanes):
-                q = place(a * stride + lane)
-                e[q], z[q], gain[q] = barrier(u[q])
-
-
-@compiled
-def _land(
-    eta: int,
-    lanes: int,
-    active: FloatArray,
-    u: FloatArray,
-    z: FloatArray,
-    gain: FloatArray,
-    dz: FloatArray,
-    answer: FloatArray,
-) -> None:
-    """After long steps, compute eps from the impulse z that Newton's method has reached: eps isn't linear in z."""
-    for a in range(eta):
-        for lane in range(lanes):
-            far = active[lane] * abs(dz[a, lane] * gain[a, lane]) > _LONG_STEP
-            # e(z) flattens away from 0: an impulse that would cross it stops there first
-            landing = eps_near_impulse(answer[a, lane]) if z[a, lane] * answer[a, lane] >= 0.0 else 0.0
-            u[a, lane] = landing if far else u[a, lane]
-
-
-@compiled
-def _start_anew(
-    eta: int,
-    pair: int,
-    lanes: int,
-    relay: FloatArray,
-    scale: FloatArray,
-    b: FloatArray,
-    e: FloatArray,
-    z: FloatArray,
-    gain: FloatArray,
-    u: FloatArray,
-    total: FloatArray,
-    lack: FloatArray,
-    stiffness: FloatArray,
-) -> bool:
-    """Replace a warm start that a jump of the source has made useless; return True if one was replaced.
-
-    Since M 1 = h, the equations of all observers add up to sum e + s sum h z = sum b: for a common impulse z, and for
-    any where M is symmetric. Where Newton's step for a common impulse would be long, every observer starts from the one
-    common impulse that meets the sum.
-    """
-    links = 0.0
-    for lane in range(lanes):
-        lack[lane] = 0.0
-        stiffness[lane] = 0.0
-        total[0, lane] = 0.0
-    for a in range(eta):
-        h = relay[pair + a]
-        links += h
-        for lane in range(lanes):
-            total[0, lane] += b[a, lane]
-            lack[lane] += b[a, lane] - e[a, lane] - scale[lane] * h * z[a, lane]
-            # (de/dz + s h) / (deps/dz): change of the sum per unit of eps
-            stiffness[lane] += 0.5 * (1.0 - e[a, lane] * e[a, lane]) + scale[lane] * h / gain[a, lane]
-    far = 0.0
-    for lane in range(lanes):
-        lack[lane] = 1.0 if abs(lack[lane]) > _JUMP * stiffness[lane] else 0.0
-        far += lack[lane]
-    if far == 0.0:
-        return False
-    for lane in range(lanes):
-        walls = 0.8 * eta  # sum e, about, where all are near the wall
-        impulse = max(abs(total[0, lane]) - walls, 0.0) / (scale[lane] * links)
-        stiffness[lane] = math.copysign(eps_near_impulse(impulse), total[0, lane])
-    for a in range(eta):
-        for lane in range(lanes):
-            u[a, lane] = stiffness[lane] if lack[lane] > 0.0 else u[a, lane]
-    return True
 
 
 @compiled
@@ -165,6 +50,7 @@ def solve(
     slope: FloatArray,
     batch: tuple[int, int],
     targets: tuple[int, int],
+    weights: Weights | None = None,
 ) -> tuple[int, int, int]:
     """One proximal step of the observers of a range of targets, in a range of environments.
 
@@ -180,22 +66,24 @@ def solve(
         slope: (P, B) the correction -P^-1 J eps at the end of the step, written.
         batch: first environment and one past the last.
         targets: first target of the layout and one past the last.
+        weights: `WeightsNow.of`, of a layout built for changing links; None for all links up.
 
     Returns:
         Evaluations of the barrier (one per pair, component and Newton iteration), then the environment and the target
         (its place in the layout) where the solve failed, -1 and -1 if it didn't. It fails on input that isn't finite,
-        and on nothing else in three hundred thousand random problems up to a million funnel widths away (at most 27
-        iterations, 5 on average; two along a run).
+        and on nothing else in three hundred thousand random problems up to a million funnel widths away (at most 28
+        iterations, 5 on average; two along a run), nor in 1.2 million with random links down (30; 65 in 6 of them).
     """
     pairs = PairArrays(*pairs)
-    one_way = pairs.last.size > 0
-    widest = profile = most = 1
+    one_way = pairs.last.size > 0  # or changing: where M needn't be symmetric
+    widest = profile = most = most_entries = 1
     for t in range(targets[0], targets[1]):
         eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
         entries = 0
         for a in range(eta):
             entries += a - pairs.first[pair + a]
         widest, profile = max(widest, eta), max(profile, eta * eta if one_way else entries)
+        most_entries = max(most_entries, pairs.entry_start[pair + eta] - pairs.entry_start[pair])
         most = max(most, n * min(max(1, LANES // n), batch[1] - batch[0]))
     diagonal, relay, first = pairs.diagonal, pairs.relay, pairs.first
     entry_start, entry_of = pairs.entry_start, pairs.entry
@@ -206,8 +94,10 @@ def solve(
     flat_e, flat_z, flat_gain, flat_u = flat[1], flat[2], flat[3], flat[7]
     lower = np.empty((profile, most))
     row_start = np.empty(widest, np.int64)
-    of_lanes = np.empty((5, most))
+    of_lanes = np.empty((6, most))
     inv_rho, scale, active, worst, poison = of_lanes[0], of_lanes[1], of_lanes[2], of_lanes[3], of_lanes[4]
+    of_links = np.empty((2 * widest + most_entries if one_way else 0, most))
+    d_lanes, h_lanes, w_lanes = of_links[:widest], of_links[widest : 2 * widest], of_links[2 * widest :]
     evaluations = 0
 
     for t in range(targets[0], targets[1]):
@@ -234,14 +124,39 @@ def solve(
                     for env in range(width):
                         answer[a, place(c * width + env)] = predictor[column, place(c0 + env)]
                         u[a, place(c * width + env)] = eps[column, place(c0 + env)]
-            for a in range(eta):
-                d, h = diagonal[pair + a], relay[pair + a]
-                for lane in range(lanes):
-                    b[a, lane] = d * answer[a, lane] - h * worst[lane]
-                for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
-                    other = entry_of[k]
+            if weights is not None:
+                diagonal_now, relay_now, entry_now = weights
+                origin_of_entries = entry_start[pair]
+                for c in range(n):
+                    for env in range(width):
+                        lane, at = place(c * width + env), place(c0 + env)
+                        for a in range(eta):
+                            d_lanes[a, lane], h_lanes[a, lane] = diagonal_now[pair + a, at], relay_now[pair + a, at]
+                        for k in range(entry_start[pair + eta] - origin_of_entries):
+                            w_lanes[k, lane] = entry_now[origin_of_entries + k, at]
+            elif one_way:
+                for a in range(eta):
                     for lane in range(lanes):
-                        b[a, lane] -= answer[other, lane]
+                        d_lanes[a, lane] = diagonal[pair + a]
+                for k in range(entry_start[pair + eta] - entry_start[pair]):
+                    for lane in range(lanes):
+                        w_lanes[k, lane] = 1.0
+            for a in range(eta):
+                if weights is not None:
+                    for lane in range(lanes):
+                        b[a, lane] = d_lanes[a, lane] * answer[a, lane] - h_lanes[a, lane] * worst[lane]
+                    for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
+                        other, from_it = entry_of[k], place(k - entry_start[pair])
+                        for lane in range(lanes):
+                            b[a, lane] -= w_lanes[from_it, lane] * answer[other, lane]
+                else:
+                    d, h = diagonal[pair + a], relay[pair + a]
+                    for lane in range(lanes):
+                        b[a, lane] = d * answer[a, lane] - h * worst[lane]
+                    for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
+                        other = entry_of[k]
+                        for lane in range(lanes):
+                            b[a, lane] -= answer[other, lane]
                 for lane in range(lanes):
                     b[a, lane] *= inv_rho[lane]
             for lane in range(lanes):
@@ -251,16 +166,21 @@ def solve(
             moving = True
             while moving:
                 barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
-                if iteration == 0 and _start_anew(
-                    eta, pair, lanes, relay, scale, b, e, z, gain, u, pivot, worst, poison
-                ):
-                    barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
+                if iteration == 0:
+                    if weights is not None:
+                        anew = start_anew_weighted(
+                            eta, lanes, h_lanes, scale, b, e, z, gain, u, pivot, worst, poison, of_lanes[5]
+                        )
+                    else:
+                        anew = start_anew(eta, pair, lanes, relay, scale, b, e, z, gain, u, pivot, worst, poison)
+                    if anew:
+                        barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 if one_way:
-                    newton_step_one_way(
+                    newton_step_weighted(
                         eta,
                         pair,
                         lanes,
-                        diagonal,
+                        d_lanes,
                         entry_start,
                         entry_of,
                         first,
@@ -274,6 +194,7 @@ def solve(
                         pivot,
                         entry,
                         lower,
+                        w_lanes,
                     )
                 else:
                     newton_step(
@@ -297,6 +218,11 @@ def solve(
                     )
                 evaluations += eta * lanes
                 iteration += 1
+                damped = iteration % (2 * DAMPED) >= DAMPED
+                if damped:
+                    for a in range(eta):
+                        for lane in range(lanes):
+                            dz[a, lane] *= 0.5
                 for lane in range(lanes):
                     worst[lane] = 0.0
                     poison[lane] = 0.0
@@ -316,8 +242,12 @@ def solve(
                     active[lane] = 1.0 if on else 0.0
                     moving = moving or on
                     longest = max(longest, worst[lane])
-                if longest > _LONG_STEP:
-                    _land(eta, lanes, active, u, z, gain, dz, answer)
+                if damped:
+                    for lane in range(lanes):
+                        if worst[lane] > 0.0:  # it moved by half a step, so that it isn't there
+                            active[lane], moving = 1.0, True
+                if longest > LONG_STEP:
+                    land(eta, lanes, active, u, z, gain, dz, answer)
                 if moving and iteration == MAX_ITERATIONS:
                     for lane in range(lanes):
                         if active[lane] > 0.0:

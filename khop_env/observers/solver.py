@@ -10,6 +10,7 @@ import numpy as np
 
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.observers.solve import LANES, solve
+from khop_env.observers.weights import Weights
 
 
 class Solver:
@@ -34,13 +35,23 @@ class Solver:
         return {**self.__dict__, "_pool": None}  # threads don't survive pickling
 
     def __call__(
-        self, tau: float, y: FloatArray, source: FloatArray, rho: FloatArray, eps: FloatArray, slope: FloatArray
+        self,
+        tau: float,
+        y: FloatArray,
+        source: FloatArray,
+        rho: FloatArray,
+        eps: FloatArray,
+        slope: FloatArray,
+        weights: Weights | None = None,
     ) -> list[tuple[int, int, int]]:
         """`solve` from the predictor `y`, which the estimates overwrite; returns its results, range by range."""
+        more = () if weights is None else (weights,)
         if len(self._ranges) == 1:
-            return [solve(self._pairs, tau, y, source, rho, eps, y, slope, *self._ranges[0])]
+            return [solve(self._pairs, tau, y, source, rho, eps, y, slope, *self._ranges[0], *more)]
         if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads
             self._pool = (os.getpid(), ThreadPoolExecutor(len(self._ranges)))
         return list(
-            self._pool[1].map(lambda part: solve(self._pairs, tau, y, source, rho, eps, y, slope, *part), self._ranges)
+            self._pool[1].map(
+                lambda part: solve(self._pairs, tau, y, source, rho, eps, y, slope, *part, *more), self._ranges
+            )
         )

@@ -12,6 +12,7 @@ import numpy as np
 
 from khop_env.observers import Exponential, FloatArray, FunnelBank, Funnels
 from khop_env.physics import BandLimitedNoise, DriftingIntegrator, Gust, SingleIntegrator, Sinusoid, one_way_links
+from khop_env.results.changing import changing_graph
 from khop_env.scenarios import Scenario
 
 Status = Literal["holds", "doesn't hold", "holds by construction", "not known"]
@@ -124,6 +125,8 @@ def _input_map(scenario: Scenario) -> Assumption:
 
 def _fixed_graph(scenario: Scenario) -> Assumption:
     statement = "the graph is undirected and doesn't change; each agent knows its k-hop neighbours"
+    if scenario.schedule is not None:
+        return Assumption("3", statement, "doesn't hold", changing_graph(scenario))
     one_way, edges = len(one_way_links(scenario.communication)), scenario.communication.number_of_edges()
     if one_way:
         return Assumption(

@@ -12,10 +12,12 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Array, Table
 
+from khop_env.network import SCHEDULES
 from khop_env.observers import Bound, Exponential
 from khop_env.observers.design import design_rule_for
 from khop_env.physics import DISTURBANCES, MODELS, AgentModel, Term
 from khop_env.scenarios.scenario import Scenario
+from khop_env.scenarios.schedules import schedule_table
 
 _EDGES_A_LINE = 10
 
@@ -70,6 +72,18 @@ def write_scenario(scenario: Scenario) -> str:
         "The communication graph, which must be connected: an edge joins two neighbours. With directed = true an edge",
         "[b, a] is a link that goes one way: agent a hears agent b.",
     )
+    if scenario.schedule is not None:
+        parts = tomlkit.aot()
+        for part in scenario.schedule.parts:
+            parts.append(schedule_table(part))
+        _section(
+            document,
+            "schedule",
+            parts,
+            "Links that come and go: a link is up where it is up in all of these. The communication graph has all that",
+            "may ever be up. A pair [low, high] is a range, from which each episode draws.",
+            f"Kinds: {', '.join(SCHEDULES)}.",
+        )
     _section(
         document,
         "task",

@@ -26,6 +26,7 @@ from khop_env.physics import (
 from khop_env.scenarios.checked import REQUIRED, CheckedTable, NotedError, ScenarioFileError, abbreviated, fits
 from khop_env.scenarios.export import write_scenario
 from khop_env.scenarios.scenario import MOST_AGENTS, Bounds, LawChoice, Scenario
+from khop_env.scenarios.schedules import read_schedule
 
 __all__ = ["ScenarioFileError", "read_scenario", "write_scenario"]
 
@@ -90,6 +91,8 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
     theta = root.table("theta") if "theta" in root.names() else None
     with root.gathering():
         disturbances = root.tables("disturbance", [])
+    with root.gathering():
+        values["schedule"] = read_schedule(root.tables("schedule", []))
     with root.gathering():
         values["law"] = _law(root.table("law", {"name": "tanh"}), laws)
     if "models" not in values:  # nothing below can be read without models

@@ -12,6 +12,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
+from khop_env.network import Schedule
 from khop_env.observers import (
     Bound,
     DesignError,
@@ -24,7 +25,7 @@ from khop_env.observers import (
     TargetObservers,
 )
 from khop_env.observers.design import design_rule_for
-from khop_env.physics import AgentModel, Disturbance, Fleet, check_task_graph, did_you_mean, validate_graph
+from khop_env.physics import AgentModel, Disturbance, Fleet, Links, check_task_graph, did_you_mean, validate_graph
 from khop_env.simulation import InitialSet, Law, Observe, Simulator
 
 MOST_AGENTS = 100_000
@@ -61,6 +62,7 @@ class Scenario:
         theta: bounds on the input estimation errors, where there are input observers.
         design_rule: from these bounds to the funnels on the disagreements: "paper", or "sharp" for the widest ones;
             None for the default of `ObserverDesign`.
+        schedule: which links of the communication graph are up, and when; None for all of them, always.
         observers: per agent the options of its observers; None for the default of `ObserverDesign`.
         disturbance: w_i(x, t), or None.
         center: (n,) centre of the box that states start in, and the observers' first guess.
@@ -85,6 +87,7 @@ class Scenario:
     theta: Bounds | None = None
     design_rule: DesignRule | None = None
     relay: bool = True
+    schedule: Schedule | None = None
     observers: tuple[TargetObservers, ...] | None = None
     disturbance: Disturbance | None = None
     center: ArrayLike = 0.0
@@ -102,6 +105,9 @@ class Scenario:
         object.__setattr__(self, "communication", validate_graph(self.communication, agents, directed=True))
         try:
             design_rule_for(self.communication, self.design_rule)
+            object.__setattr__(self, "schedule", Schedule.of(self.schedule))
+            if self.schedule is not None:
+                self.schedule.bind(Links.of(self.communication), self.fleet.position_index)
         except ValueError as error:
             raise ValueError(f"scenario {self.name!r}: {error}") from None
         object.__setattr__(self, "task", check_task_graph(self.task, self.communication, self.k))
@@ -206,6 +212,7 @@ class Scenario:
             self.relay,
             self.observers,
             self.design_rule,
+            self.schedule,
         )
         for name, funnels in (("delta", design.states), ("theta", design.inputs)):
             for bound in {id(f): f for f in funnels.bounds if not isinstance(f, Exponential)}.values():

@@ -25,7 +25,8 @@ from khop_env.observers import (
     Proximal,
     SolveError,
 )
-from khop_env.observers.disagreement import disagreement
+from khop_env.observers.base import LinksNow, weights_at
+from khop_env.observers.disagreement import disagreement_by
 from khop_env.physics import read_only
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
@@ -354,6 +355,8 @@ class Simulator:
         return inputs
 
     def _disagreement(self, funnels: Funnels, memory: str, source: FloatArray) -> FloatArray:
+        links = None if self.design.schedule is None else LinksNow(self.design, self.num_envs)
+        weights = weights_at(links, self.state)[funnels is self.design.inputs]
         out = np.zeros((funnels.layout.size, self.num_envs))
-        disagreement(funnels.layout.arrays, self.state.memory[memory], source, out)
+        disagreement_by(funnels.layout, weights, self.state.memory[memory], source, out)
         return out.T

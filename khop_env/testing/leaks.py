@@ -76,7 +76,8 @@ def _require(env: KHopEnv, allowed: set[int], text: str, read: Callable[[EnvStat
     def write(state: EnvState) -> None:
         for part in parts:
             array = read(state)[part]
-            array += 0.7 + 0.1 * np.arange(array.size).reshape(array.shape)  # far from all estimates
+            change = 0.7 + 0.1 * np.arange(array.size).reshape(array.shape)  # far from all estimates
+            array += change if array.dtype.kind == "f" else (10.0 * change).astype(array.dtype)
 
     ids = env.batched.fleet.ids
     for i, column in changed_by(env, write).items():

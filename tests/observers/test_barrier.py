@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from khop_env.observers.barrier import barrier, eps_near_impulse
 from khop_env.observers.disagreement import barrier_curvature, correction, transformation, transformation_slope
 from khop_env.observers.layout import PairLayout
-from khop_env.observers.solve import _barrier, eps_near_impulse
 from khop_env.physics import Links, k_hop_neighbors
 
 mpmath.mp.dps = 60
@@ -42,7 +42,7 @@ def test_transformation_and_its_slope(e):
 
 
 @given(e=INSIDE)
-def test_curvature_of_the_barrier_is_at_least_four(e):
+def test_curvature_of_thebarrier_is_at_least_four(e):
     """phi''(e) = 4 (1 + e T) / (1 - e^2)^2 >= 4: the barrier is strictly convex, and stiff by 4 / rho^2 at least."""
     assert barrier_curvature(e) == pytest.approx(float(exact_curvature(e)), rel=16 * ULP)
     assert barrier_curvature(e) >= 4.0
@@ -56,7 +56,7 @@ def test_curvature_is_the_second_derivative(e):
     )
 
 
-def test_barrier_is_self_concordant_up_to_a_constant():
+def testbarrier_is_self_concordant_up_to_a_constant():
     """|phi'''| <= 1.31 phi''^(3/2) on the whole interval: phi is self-concordant (Nesterov and Nemirovskii, 1994)."""
     e = np.concatenate([np.linspace(-0.999, 0.999, 20_001), 1 - np.geomspace(1e-15, 1e-3, 1000)])
     t, j = 2 * np.arctanh(e), 2 / ((1 - e) * (1 + e))
@@ -68,9 +68,9 @@ def test_barrier_is_self_concordant_up_to_a_constant():
 
 
 @given(eps=TRANSFORMED)
-def test_barrier_in_the_transformed_unknown(eps):
+def testbarrier_in_the_transformed_unknown(eps):
     """e = tanh(eps / 2) inverts T, z = phi'(e) = T J_T = eps (1 + cosh eps), and d eps / dz is its reciprocal slope."""
-    e, z, gain = _barrier(eps)
+    e, z, gain = barrier(eps)
     exact = mpmath.mpf(eps)
     assert e == pytest.approx(float(mpmath.tanh(exact / 2)), rel=6 * ULP, abs=0.0)
     assert z == pytest.approx(float(exact * (1 + mpmath.cosh(exact))), rel=16 * ULP, abs=0.0)
@@ -87,7 +87,7 @@ def test_impulse_and_curvature_agree(eps):
     """d z / d e = phi''(e), so that Newton's matrix diag(de / dz) + s M is the proximal problem's Hessian; de/dz <=
     1/4.
     """
-    e, _, gain = _barrier(eps)
+    e, _, gain = barrier(eps)
     exact = mpmath.mpf(eps)
     slope_of_e = mpmath.mpf(gain) / (1 + mpmath.cosh(exact))  # de/dz = de/deps deps/dz
     assert float(1 / slope_of_e) == pytest.approx(float(exact_curvature(mpmath.tanh(exact / 2))), rel=1e-14)
@@ -110,7 +110,7 @@ def test_impulse_is_inverted_over_six_hundred_decades(exponent, sign):
 def test_no_impulse_is_no_disagreement():
     """T(0) = 0."""
     assert abs(eps_near_impulse(0.0)) < 1e-299
-    assert _barrier(0.0) == (0.0, 0.0, 0.5)
+    assert barrier(0.0) == (0.0, 0.0, 0.5)
 
 
 @given(

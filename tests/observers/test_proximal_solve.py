@@ -12,14 +12,21 @@ from khop_env.physics import Links, k_hop_neighbors
 from tests.strategies import SEEDS, connected_graphs, digraphs, hops
 
 
-def layout_of(graph, k, relay, dimensions=None):
+def layout_of(graph, k, relay, dimensions=None, changing=False):
     """A layout over all agents, of one component each by default."""
     dimensions = dimensions or [1] * len(graph)
     offsets = np.concatenate([[0], np.cumsum(dimensions)])
-    return PairLayout.build(Links.of(graph), k_hop_neighbors(graph, k, relay=relay), dimensions, offsets, relay=relay)
+    return PairLayout.build(
+        Links.of(graph),
+        k_hop_neighbors(graph, k, relay=relay),
+        dimensions,
+        offsets,
+        relay=relay,
+        changing=changing,
+    )
 
 
-def run(layout, tau, predictor, source, rho, eps=None, batch=None, targets=None):
+def run(layout, tau, predictor, source, rho, eps=None, batch=None, targets=None, weights=None):
     """`solve` on copies: the estimates, eps, slope and what it returned."""
     eps = np.zeros_like(predictor) if eps is None else eps.copy()
     estimate, slope = np.full_like(predictor, np.nan), np.full_like(predictor, np.nan)
@@ -34,6 +41,7 @@ def run(layout, tau, predictor, source, rho, eps=None, batch=None, targets=None)
         slope,
         batch or (0, predictor.shape[1]),
         targets or (0, len(layout.blocks)),
+        *([] if weights is None else [weights]),
     )
     return estimate, eps, slope, result
 
@@ -48,17 +56,30 @@ def problem(layout, rng, batch=1, hard=True):
     return tau, predictor, source, rho
 
 
-def full_matrix(layout):
+def matrix_of(layout, index, weights=None):
+    """M of a target; with weights that of the first environment."""
+    if weights is None:
+        return layout.matrix(index)
+    block, arrays = layout.blocks[index], layout.arrays
+    m = np.diag(weights[0][block.pairs, 0])
+    for a, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
+        for entry in range(arrays.entry_start[pair], arrays.entry_start[pair + 1]):
+            m[a, arrays.entry[entry]] = -weights[2][entry, 0]
+    return m
+
+
+def full_matrix(layout, weights=None):
     """M of all targets and components at once, and the weight of the true state in each disagreement."""
     m, h = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     for index, block in enumerate(layout.blocks):
         part, n = block.columns, block.components
-        m[part, part] = np.kron(layout.matrix(index), np.eye(n))
-        h[part] = np.repeat(layout.arrays.relay[block.pairs], n)
+        m[part, part] = np.kron(matrix_of(layout, index, weights), np.eye(n))
+        relay = layout.arrays.relay if weights is None else weights[1][:, 0]
+        h[part] = np.repeat(relay[block.pairs], n)
     return m, h
 
 
-def check_solution(layout, tau, predictor, source, rho, estimate, eps, slope):
+def check_solution(layout, tau, predictor, source, rho, estimate, eps, slope, weights=None):
     """y+ = y* - tau P^-1 phi'(e+), |e+| < 1, and xi recomputed from y+ is rho e+; each to its rounding."""
     rows = rho[layout.column_row]
     z = eps * (1.0 + np.cosh(eps))  # phi'(e) in terms of eps = T(e)
@@ -67,7 +88,7 @@ def check_solution(layout, tau, predictor, source, rho, estimate, eps, slope):
     e = np.tanh(0.5 * eps)
     assert np.all(np.isfinite(eps))
     assert np.all(np.abs(e) <= 1.0)  # = 1 only where 1 - |e| = 2 exp(-|eps|) is below a float's spacing
-    m, h = full_matrix(layout)
+    m, h = full_matrix(layout, weights)
     truth = source[layout.column_source]
     xi = m @ estimate - h[:, None] * truth
     rounding = 4e-16 * (np.abs(m) @ (np.abs(estimate) + np.abs(predictor)) + h[:, None] * np.abs(truth))
