@@ -20,7 +20,7 @@ from khop_env.physics import AgentModel
 
 
 @dataclass(frozen=True)
-class Message:
+class Broadcast:
     """The message that an agent broadcasts to its 1-hop neighbours.
 
     Attributes:
@@ -76,9 +76,9 @@ class ObserverAgent:
 
     def message(
         self, state: FloatArray, input_map: FloatArray, measured: Mapping[int, tuple[FloatArray, FloatArray]]
-    ) -> Message:
+    ) -> Broadcast:
         """The message to its neighbours: its own state and input, measurements of its neighbours, and its estimates."""
-        return Message(
+        return Broadcast(
             state,
             input_map,
             measured,
@@ -86,7 +86,7 @@ class ObserverAgent:
             {i: target.input_estimate for i, target in self.targets.items() if target.omega is not None},
         )
 
-    def derivative(self, t: float, i: int, inbox: Mapping[int, Message]) -> tuple[FloatArray, ...]:
+    def derivative(self, t: float, i: int, inbox: Mapping[int, Broadcast]) -> tuple[FloatArray, ...]:
         """Rates of change of its estimates of target `i`, (n_i,) each, and the normalised disagreements e and q.
 
         Without an input observer of that target the second and the fourth are empty.
