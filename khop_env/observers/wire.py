@@ -159,12 +159,12 @@ class Message:
         """
         if len(data) < _HEADER.size:
             raise ValueError(f"a message has {_HEADER.size} bytes at least; got {len(data)}")
-        version, flags, fingerprint, sender, _ = _HEADER.unpack_from(data)
+        version, flags, theirs, sender, _ = _HEADER.unpack_from(data)
         if version != VERSION:
             raise ValueError(f"the message has version {version}, this is version {VERSION}; update the older robot")
-        if fingerprint != fingerprint(design):
+        if theirs != fingerprint(design):
             raise ValueError(
-                f"the message is of another fleet ({fingerprint:08x}) than {design} ({fingerprint(design):08x}): "
+                f"the message is of another fleet ({theirs:08x}) than {design} ({fingerprint(design):08x}): "
                 "models, links, k, relay or input observers differ"
             )
         if sender >= len(design.fleet) or flags & ~_PPSO >= len(_LETTER):
