@@ -39,7 +39,7 @@ def replay(folder):
     newest = dict.fromkeys(links, -1)
     air = []  # what was sent, round by round
 
-    watched = nodes[run.figure_agent]
+    watched = max(nodes, key=lambda node: len(node.targets))
     print(f"{run.name}: {watched.id} hears {', '.join(watched.hears)}; {network.described()}")
     print("    t (s)  target        error (m)  certified (m)  age (s)")
     outside = checked = 0

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-import numpy as np
-
 from khop_env.network import Network, PlainLink, plain_noise
 from khop_env.observers import Estimate, Message, ObserverDesign, ObserverNode
 from khop_env.physics import FloatArray
