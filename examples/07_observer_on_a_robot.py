@@ -1,6 +1,6 @@
 """Observers in robots' own loops: replay a run through one node per robot, over links that lose and delay messages.
 
-    python examples/07_observer_on_a_robot.py [FOLDER of a `khop run`]
+Takes the folder of a `khop run`; without one it makes a short run itself.
 """
 
 import json
@@ -61,7 +61,9 @@ def replay(folder):
                 checked, outside = checked + 1, outside + (error > bound).any()
                 if node is watched and number in (3, 10, 40):
                     since = f"{age:7.2f}" if np.isfinite(age) else "nothing yet"
-                    print(f"  {t:7.2f}  {target:12s}  {error.max():9.4f}  {bound.max():13.4f}  {since}")
+                    place = fleet.models[fleet.agent(target)].position_index
+                    worst = error[place].max(), bound[place].max()
+                    print(f"  {t:7.2f}  {target:12s}  {worst[0]:9.4f}  {worst[1]:13.4f}  {since}")
 
     print(f"errors beyond the certified bound: {outside} of {checked}")
     for estimator in ("relay", "ppso"):

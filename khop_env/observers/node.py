@@ -158,7 +158,7 @@ class ObserverNode:
             target.freshest = replace(target.freshest, state=state)
         for i, estimate in estimates.items():
             self._states[i].estimate = estimate
-        self.time, self._x, self._g = t, x, g
+        self.time, self._x, self._g = float(t), x, g
         self._updates += 1
         self.due = self._step is None or t >= (self._round - 1e-9 * self._round) * self._period
         if self.due:

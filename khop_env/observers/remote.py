@@ -140,7 +140,8 @@ class RemoteAgent:
         box = self._box(state, t)
         if proposal is None:
             low, high = box  # without a finite region the prediction is the centre; so it is where nothing is certain
-            proposal = np.where(np.isfinite(self._known.region), 0.5 * (low + high), state)
+            with np.errstate(invalid="ignore"):
+                proposal = np.where(np.isfinite(self._known.region), 0.5 * (low + high), state)
         estimate = box.clip(proposal)
         # an empty box proves that some assumption doesn't hold: then nothing is certain
         bound = np.full(len(state), math.inf) if box.empty() else box.far_face(estimate)
