@@ -205,7 +205,14 @@ class Message:
     def size(
         design: ObserverDesign, agent: str | int, estimator: EstimatorName = "ppso", dtype: NumberFormat = "float32"
     ) -> int:
-        """Bytes of a message of an agent, by its id or index."""
+        """Number of bytes of a message.
+
+        Args:
+            design: the observers of the fleet.
+            agent: the sender, by id or index.
+            estimator: of its node.
+            dtype: format of the numbers.
+        """
         return _form(design, design.fleet.agent(agent), estimator, dtype).layout.size
 
 

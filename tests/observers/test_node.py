@@ -137,8 +137,11 @@ def test_a_round_by_hand() -> None:
         e = (2.0 * y - sum(held)) / rho
         slope = math.log((1.0 + e) / (1.0 - e)) * 2.0 / (1.0 - e * e)
         assert y - predicted + T * slope / rho == pytest.approx(0.0, abs=1e-14)
+    y, g = node._states[0].estimate, node._inputs[0].estimate
     node.update(2 * T, [0.1], [0.2])
     passed_on = node.message()
+    assert abs(g) > 0.01
+    assert passed_on.estimates[0] == pytest.approx(y + T * g)
     assert passed_on.known[0][:2] == (T / 2, 2)
     assert passed_on.heard[1] == 3.0
     assert passed_on.heard[2] == 4.0
@@ -339,8 +342,10 @@ def test_the_order_within_a_round_does_not_matter(estimator: str) -> None:
         for node, order in ((forwards, (1, 3)), (backwards, (3, 1))):
             node.update(step * T, messages[0].state, np.zeros(2))
             for p in order:
-                node.receive(messages[p])
-                node.receive(messages[p])
+                # one and the same state of agent 2, which they don't predict alike
+                known = {i: each._replace(state=each.state + 1e-3 * p) for i, each in messages[p].known.items()}
+                assert node.receive(dataclasses.replace(messages[p], known=known))
+                assert not node.receive(messages[p])
         for one, other in zip(forwards.estimates(step * T).values(), backwards.estimates(step * T).values()):  # noqa: B905
             for values, same in zip(one, other, strict=True):
                 np.testing.assert_array_equal(values, same)
