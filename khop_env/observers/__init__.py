@@ -35,8 +35,8 @@ from khop_env.observers.networked import ESTIMATORS, Networked, as_estimator
 from khop_env.observers.node import Estimate, ObserverNode
 from khop_env.observers.performance import Exponential, FunnelBank, PerformanceFunction, lower_bound
 from khop_env.observers.proximal import Proximal
-from khop_env.observers.wire import Known, Message
 from khop_env.observers.rounds import Rounds
+from khop_env.observers.wire import Known, Message
 
 __all__ = [
     "ESTIMATORS",

@@ -54,6 +54,8 @@ class ObserverNode:
         dtype: number format of messages. Rounding to float32 or float16 is an error of what was sent and becomes part
             of the bounds; messages that were rounded more than that are refused.
         largest: largest |x| of what is sent, a number or (n,); needed unless dtype is float64.
+        sampled: whether agents follow the difference equation x+ = x + step (f + g + w) of simulators over a network,
+            in place of the differential equation.
 
     Attributes:
         id: of the agent.
@@ -82,6 +84,7 @@ class ObserverNode:
         skew: float = 0.0,
         dtype: NumberFormat = "float64",
         largest: FloatArray | float | None = None,
+        sampled: bool = False,
     ) -> None:
         fleet = design.fleet
         check_choice("estimator", estimator, get_args(EstimatorName))
@@ -94,6 +97,8 @@ class ObserverNode:
             )
         if not 0.0 <= skew < math.inf:
             raise ValueError(f"skew must be finite and not negative, in s; got {skew!r}")
+        if sampled and skew > 0.0:
+            raise ValueError(f"a sampled system has one clock: skew must be 0 with sampled=True; got {skew!r}")
         if dtype != "float64" and largest is None:
             raise ValueError(
                 f"dtype={dtype!r} rounds what is sent: give `largest`, the largest |x|, to bound that error"
@@ -113,7 +118,9 @@ class ObserverNode:
         for i in sorted(i for observer, i in design.knowledge.slot if observer == self._agent):
             own = fleet.state_slice(i)
             of_target = {name: value[own] for name, value in values.items()}
-            self._targets[i] = RemoteAgent(fleet.models[i], step=step or period, skew=skew, **of_target)
+            self._targets[i] = RemoteAgent(
+                fleet.models[i], step=step or period, skew=skew, sampled=sampled, **of_target
+            )
         ppso = estimator == "ppso"
         self._states = local_observers(design, design.states, self._agent, guess) if ppso else {}
         self._inputs = local_observers(design, design.inputs, self._agent, np.zeros(fleet.n)) if ppso else {}
@@ -140,7 +147,7 @@ class ObserverNode:
         Args:
             t: in s, never less than before.
             own_state: (n_a,) as measured now.
-            own_input: (m_a,) u that is applied from now on.
+            own_input: (m_a,) u that was in force until now.
 
         Raises:
             ValueError: for a value that is misshapen or not finite, or a time that runs backwards or far ahead.

@@ -21,6 +21,7 @@ from khop_env.observers.radius import RadiusTable, exponential
 from khop_env.physics import AgentModel, Growth
 
 _MOST_INTERVALS = 100_000
+LONGEST_SAMPLED = 8.0  # of `Growth.step`: h |df/dx| is at most 1/2
 
 
 class Estimate(NamedTuple):
@@ -73,10 +74,14 @@ class RemoteAgent:
         radius: (n,) of its initial set, inf where nothing is known.
         skew: bound on the difference of any two clocks, in s.
         rounding: (n,) largest error of a number's rounding, made once on every link that the state has come.
+        sampled: whether the agent follows x+ = x + step (f + g + w), in place of the differential equation.
 
     Attributes:
         freshest: what is known of it.
         reason: why nothing is certified of it; "" if every component has a bound.
+
+    Raises:
+        ValueError: for a sampled system with too long a step.
     """
 
     def __init__(
@@ -90,6 +95,7 @@ class RemoteAgent:
         radius: FloatArray,
         skew: float,
         rounding: FloatArray,
+        sampled: bool,
     ) -> None:
         self._step, self._skew = step, skew
         self.freshest = Received(center)
@@ -97,6 +103,13 @@ class RemoteAgent:
         self._known = _certificate(model, *(_frozen(values) for values in (disturbance, noise, region)))
         self._initial = _certificate(model, *(_frozen(values) for values in (disturbance, radius, region)))
         growth = self._growth = self._known.growth
+        # in a sampled system, radii after 0, 1, ... steps: of the initial set, and of what has arrived
+        self._in_steps = [[radius], [noise]] if sampled else None
+        if sampled and growth is not None and step > LONGEST_SAMPLED * growth.step * (1.0 + 1e-9):
+            raise ValueError(
+                f"sampled systems with {type(model).__name__} need steps of at most "
+                f"{LONGEST_SAMPLED * growth.step:.4g} s, or nothing is certain of them; got {step:g}"
+            )
         self._drift, self.reason = extended_drift(model, growth), self._known.reason
         self._rounding = None
         if growth is None:
@@ -114,7 +127,9 @@ class RemoteAgent:
             self._over_quarter = exponential(rising, 0.25 * skew)
 
     def moved(self, state: FloatArray, t: float, dt: float) -> FloatArray:
-        """The state (n,) that is predicted for `dt` s after time `t`: Runge-Kutta steps of order 4, one each interval.
+        """The state (n,) that is predicted for `dt` s after time `t`, a step of `step` s after the other.
+
+        Steps are explicit Euler's for a sampled system, else Runge-Kutta's of order 4.
 
         Raises:
             ValueError: if that takes more than 100 000 intervals.
@@ -122,6 +137,11 @@ class RemoteAgent:
         if dt == 0.0:
             return state
         intervals = intervals_of(dt, self._step)
+        if self._in_steps is not None:
+            h = dt / intervals
+            for k in range(intervals):
+                state = state + h * self._rate(state, t + k * h)
+            return state
         longest = LONGEST_STEP if self._growth is None else self._growth.step
         parts = max(1, math.ceil(abs(dt) / intervals / longest - 1e-9))
         age, steps = np.array([dt]), np.array([intervals * parts])
@@ -152,10 +172,32 @@ class RemoteAgent:
         hops = self.freshest.hops
         age = t - self.freshest.stamp if hops else t
         certificate = self._known if hops else self._initial
-        radius = certificate.radius(np.array(age)) if self._skew == 0.0 else self._with_skew(certificate, state, t, age)
+        if self._in_steps is not None:
+            radius = self._sampled_radius(self._in_steps[hops > 0], age)
+        elif self._skew > 0.0:
+            radius = self._with_skew(certificate, state, t, age)
+        else:
+            radius = certificate.radius(np.array(age))
         if self._rounding is not None:
             radius = radius + hops * self._rounding.at(np.array(age + self._skew))
         return Box.around(state, radius).intersect(Box(-certificate.region, certificate.region))
+
+    def _sampled_radius(self, kept: list[FloatArray], age: float) -> FloatArray:
+        """The radius of r+ = r + h (min(Lambda r, spread) + g_bar + w_bar); `kept` are those after 0, 1, ... steps."""
+        steps = intervals_of(age, self._step) if age > 0.0 else 0
+        on_grid = abs(age - steps * self._step) <= 1e-9 * self._step
+        radii, h = (kept, self._step) if on_grid else (kept[:1], age / steps)
+        while len(radii) <= steps:
+            radii.append(self._widened(radii[-1], h))
+        return radii[steps] * (1.0 + 1e-9)
+
+    def _widened(self, radius: FloatArray, h: float) -> FloatArray:
+        growth = self._growth
+        if growth is None:
+            return np.full(len(radius), math.inf)
+        with np.errstate(invalid="ignore"):
+            apart = np.where(growth.matrix == 0.0, 0.0, growth.matrix * radius).sum(axis=1)
+        return radius + h * (np.fmin(apart, growth.spread) + self._known.rate)
 
     def _with_skew(self, certificate: Certificate, state: FloatArray, t: float, age: float) -> FloatArray:
         """The radius where the true age is within the skew of `age`: its largest value, and the prediction's motion."""
