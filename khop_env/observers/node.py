@@ -178,6 +178,8 @@ class ObserverNode:
     def message(self) -> Message:
         """What to send in this round: before anything of this round is received, so that rounds are the same for all.
 
+        What came late, of earlier rounds, may be received before, to be passed on at once.
+
         Raises:
             ValueError: before the first update, or for an own state beyond `largest`.
         """

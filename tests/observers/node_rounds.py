@@ -3,10 +3,30 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
+
+import networkx as nx
 
 from khop_env.network import Network, PlainLink, plain_noise
-from khop_env.observers import Estimate, Message, ObserverDesign, ObserverNode
-from khop_env.physics import FloatArray
+from khop_env.observers import Estimate, Exponential, Message, ObserverDesign, ObserverNode
+from khop_env.physics import AgentModel, Fleet, FloatArray
+
+T = 0.05  # s
+
+
+def design_of(
+    models: Sequence[AgentModel], k: int = 2, graph: nx.Graph | None = None, relay: bool = True, **options: object
+) -> ObserverDesign:
+    """Agents in a row, or on another graph."""
+    return ObserverDesign(
+        Fleet(models),
+        nx.path_graph(len(models)) if graph is None else graph,
+        k,
+        Exponential(50.0, 0.5, 2.0),
+        Exponential(100.0, 2.0, 2.0),
+        relay,
+        **options,
+    )
 
 
 class Rounds:
