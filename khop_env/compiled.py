@@ -18,8 +18,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
+
+try:
+    import numba
+except ImportError:  # kernels then run as plain Python: slow, but enough for one robot's observers
+    numba = None  # type: ignore[assignment]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -46,6 +50,8 @@ def inlined(function: F) -> F:
 
 
 def _cached(function: F, **options: str) -> F:
+    if numba is None:
+        return function
     compile_with = functools.partial(numba.njit, nogil=True, error_model="numpy", **options)
     try:
         dispatcher: Any = compile_with(cache=True)(function)

@@ -25,6 +25,7 @@ def test_the_readmes_python_runs(capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.name)
 def test_example_runs(path, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # they write below runs/
+    monkeypatch.setattr("sys.argv", [str(path)])
     runpy.run_path(str(path), run_name="__main__")
     assert capsys.readouterr().out
 

@@ -32,9 +32,11 @@ from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explic
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
 from khop_env.observers.messages import MessagePassing
 from khop_env.observers.networked import ESTIMATORS, Networked, as_estimator
+from khop_env.observers.node import Estimate, ObserverNode
 from khop_env.observers.performance import Exponential, FunnelBank, PerformanceFunction, lower_bound
 from khop_env.observers.proximal import Proximal
 from khop_env.observers.rounds import Rounds
+from khop_env.observers.wire import Known, Message
 
 __all__ = [
     "ESTIMATORS",
@@ -47,6 +49,7 @@ __all__ = [
     "Derivative",
     "DesignError",
     "DesignRule",
+    "Estimate",
     "Estimator",
     "Explicit",
     "Exponential",
@@ -58,10 +61,13 @@ __all__ = [
     "Funnels",
     "Information",
     "IntArray",
+    "Known",
     "Memory",
+    "Message",
     "MessagePassing",
     "Networked",
     "ObserverDesign",
+    "ObserverNode",
     "Observers",
     "PairArrays",
     "PairLayout",

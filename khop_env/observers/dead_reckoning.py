@@ -56,8 +56,8 @@ def predict(
     start = np.broadcast_to(np.asarray(t, np.float64), age.shape)
     steps = np.maximum(1, np.ceil(age / longest - 1e-9)).astype(np.int64)
     drift = extended_drift(model, growth)
-    coarse = _integrated(drift, x.T, start, age, steps)
-    fine = _integrated(drift, x.T, start, age, 2 * steps)
+    coarse = integrated(drift, x.T, start, age, steps)
+    fine = integrated(drift, x.T, start, age, 2 * steps)
     return Prediction(fine.T, np.abs(fine - coarse).T)
 
 
@@ -74,14 +74,14 @@ def extended_drift(model: AgentModel, growth: Growth | None) -> Callable[[FloatA
     return extended
 
 
-def _integrated(
+def integrated(
     drift: Callable[[FloatArray, FloatArray], FloatArray],
     x: FloatArray,
     start: FloatArray,
     age: FloatArray,
     steps: IntArray,
 ) -> FloatArray:
-    """States (B, n) after `age`, in `steps` equal steps of each row."""
+    """States (B, n) after `age`, which may be negative, in `steps` equal steps of each row."""
     x = np.ascontiguousarray(x, np.float64)
     for k in range(int(steps.max(initial=0))):
         h = np.where(k < steps, age / steps, 0.0)  # rows that are there already stay

@@ -20,7 +20,7 @@ from khop_env.physics import AgentModel
 
 
 @dataclass(frozen=True)
-class Message:
+class Broadcast:
     """The message that an agent broadcasts to its 1-hop neighbours.
 
     Attributes:
@@ -82,7 +82,7 @@ class ObserverAgent:
     def __init__(self, index: int, targets: dict[int, HeldEstimate]) -> None:
         self.index, self.targets = index, targets
 
-    def reached(self, i: int, inbox: Mapping[int, Message]) -> bool:
+    def reached(self, i: int, inbox: Mapping[int, Broadcast]) -> bool:
         """Whether target `i` reaches this agent: a neighbour sends its true state, or an estimate of it."""
         target = self.targets[i]
         return any(inbox[p].knows(i, p) for p in target.relays if p in inbox) or any(
@@ -95,7 +95,7 @@ class ObserverAgent:
         input_map: FloatArray,
         measured: Mapping[int, tuple[FloatArray, FloatArray]],
         known: Collection[int],
-    ) -> Message:
+    ) -> Broadcast:
         """The message to its neighbours: its own state and input, measurements of its neighbours, and its estimates.
 
         Args:
@@ -105,7 +105,7 @@ class ObserverAgent:
             known: the targets that reach it; of others it knows nothing new, and sends nothing.
         """
         targets = {i: target for i, target in self.targets.items() if i in known}
-        return Message(
+        return Broadcast(
             state,
             input_map,
             measured,
@@ -113,7 +113,7 @@ class ObserverAgent:
             {i: target.input_estimate for i, target in targets.items() if target.omega is not None},
         )
 
-    def derivative(self, t: float, i: int, inbox: Mapping[int, Message]) -> tuple[FloatArray, ...]:
+    def derivative(self, t: float, i: int, inbox: Mapping[int, Broadcast]) -> tuple[FloatArray, ...]:
         """Rates of change of its estimates of target `i`, (n_i,) each, and the normalised disagreements e and q.
 
         Without an input observer of that target the second and the fourth are empty.

@@ -42,7 +42,7 @@ def test_transformation_and_its_slope(e):
 
 
 @given(e=INSIDE)
-def test_curvature_of_thebarrier_is_at_least_four(e):
+def test_curvature_of_the_barrier_is_at_least_four(e):
     """phi''(e) = 4 (1 + e T) / (1 - e^2)^2 >= 4: the barrier is strictly convex, and stiff by 4 / rho^2 at least."""
     assert barrier_curvature(e) == pytest.approx(float(exact_curvature(e)), rel=16 * ULP)
     assert barrier_curvature(e) >= 4.0
