@@ -17,7 +17,7 @@ from tests.env.playing import (
     random_actions,
     same,
 )
-from tests.env.test_networked import BURSTS, SILENT, cases
+from tests.env.test_networked_environments import BURSTS, SILENT, cases
 
 
 @pytest.mark.parametrize("observe", ["estimate", "local"])
