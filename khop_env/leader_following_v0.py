@@ -25,7 +25,7 @@ bound that was chosen in advance: the case where estimates matter most.
 An agent observes its own state and a list of slots, one for every other agent within k hops: its neighbours (1 hop),
 whose states it receives, and its k-hop targets (2 to k hops), whose states it estimates. Slots are ordered by relevance
 to its task: task edges first, then hop distance, then index. With uniform observations the list is padded to the
-longest; an invalid slot is all zeros.
+longest; a slot that isn't in use is all zeros.
 `env.layout(agent)` names every column with its unit, and reads and builds observations.
 
 | Columns                     | Content                                                                           |
@@ -47,6 +47,20 @@ longest; an invalid slot is all zeros.
 `observe="oracle"` puts true states and `observe="local"` zeros into the slots of k-hop targets; nothing else changes,
 and the spaces stay the same.
 
+Under a network (`network="wifi"`) agents know of each other by messages only, one a period, which can be late or lost:
+neighbours are estimated, too, and slots say how old the information is that an estimate rests on.
+
+| Columns                     | Content under a network                                                           |
+|-----------------------------|-----------------------------------------------------------------------------------|
+| slot0.valid                 | 1 once anything about the agent has arrived; before, the slot has the first guess |
+| slot0.heard                 | 1 if something newer about it has arrived within this control period              |
+| slot0.hops                  | number of links over which the newest has come; 0 before anything has arrived     |
+| slot0.age                   | time since the newest was measured, in s; before anything has arrived: since reset |
+| slot0.bound.<state>         | certified bound on this very estimate's error, for neighbours, too                |
+
+With `observe="oracle"` all slots have true states and are valid; with `observe="local"` neighbours are estimated from
+messages, and the slots of k-hop targets are zeros.
+
 ### Action Space
 
 Each agent's inputs as fractions of their limits, in [-1, 1]; larger values are clipped and counted in the infos. With
@@ -64,7 +78,8 @@ and its input u_i as fractions of the limits. With `reward="team"` all agents ge
 Episodes are truncated after `max_cycles` control periods, and terminate only if `success_radius` asks for it.
 Infos are numbers under constant keys: `task_error`, the root mean square error along the agent's own task edges in m;
 `max_normalized_disagreement` and `max_error_to_bound`, the largest |xi| / rho and |error| / bound of any observer since
-the last action, below 1 by guarantee; `clipped_observations` and `clipped_actions`.
+the last action, below 1 by guarantee (under a network the bound is the certified one, of estimates of neighbours, too,
+and xi is what an agent computes from the messages that it holds); `clipped_observations` and `clipped_actions`.
 
 Initial states and disturbances are drawn per episode from the seed; `reset(options={"initial_state": {"drifter_1":
 [0.5, -0.5]}})` gives some or all of them. `get_state()` and `set_state()` save and restore everything, and a pickled or
@@ -77,7 +92,7 @@ from khop_env import leader_following_v0
 
 leader_following_v0.parallel_env(scenario="convoy", observe="estimate", bounds=False, uniform=True, max_cycles=200,
 control_period=0.05, dt=None, order=1, actuator="direct", reward="agent", effort=0.1, success_radius=None,
-limit=100.0, threads=1, render_mode=None,
+limit=100.0, threads=1, network=None, estimator=None, render_mode=None,
 leaders=None, follow=None, leader_speed=None, spacing=1.0)
 ```
 
@@ -119,10 +134,17 @@ requires (Assumption 2-ii of the paper)
 
 `success_radius`: terminate the episode when no agent's task error exceeds it, in m (default None: never)
 
-`limit`: bound on positions and other states in observations, in their units (default 100); larger values are clipped
-and counted in the infos
+`limit`: bound on positions and other states in observations, in their units, and on ages in s (default 100); larger
+values are clipped and counted in the infos
 
 `threads`: of the observers' solve (default 1)
+
+`network`: how messages are exchanged: a profile ("ideal", "urllc", "factory", "wifi", "lossy", "saturation", "espnow",
+"crazyradio"), also with other values ("lossy:period=0.1,loss=0.1..0.3,burst=5"), a `khop_env.network.Network` or a
+mapping of its values. By default the scenario's own, which is none: exchange in continuous time
+
+`estimator`: from messages to estimates under a network: "ppso" for the paper's observers, "relay" for stamped states
+that are passed on and predicted, or an object of your own. By default the scenario's own, "ppso"
 
 `render_mode`: None (default), "human" or "rgb_array"
 

@@ -16,7 +16,7 @@ from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
 from khop_env.extras import how_to_install
 from khop_env.objects import is_object_name, load_object
-from khop_env.observers import Proximal
+from khop_env.observers import Networked, Observers, Proximal
 from khop_env.physics import did_you_mean
 from khop_env.scenarios.named import SCENARIOS, describe, parameters_from_text, scenario, scenarios
 from khop_env.scenarios.scenario import Scenario
@@ -117,8 +117,8 @@ def make_batched(
     chosen = _chosen_scenario(task.default_scenario if scenario is None else scenario)
     if isinstance(task, type):
         task = task(**{name: value for name, value in arguments.items() if name in of_task})
-    simulator = chosen.build(observers=Proximal(settings.order, settings.threads), num_envs=int(num_envs))
-    return BatchedEnv(simulator, task, settings, chosen.name)
+    settings, observers = _observers_of(settings, chosen)
+    return BatchedEnv(chosen.build(observers=observers, num_envs=int(num_envs)), task, settings, chosen.name)
 
 
 def make(
@@ -282,6 +282,22 @@ def _task_parameters(task: type[Task]) -> dict[str, Any]:
 
 def _defaults(settings: type[Settings]) -> dict[str, Any]:
     return {field.name: field.default for field in dataclasses.fields(settings)}
+
+
+def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Observers]:
+    """The observers, and the settings with the scenario's network and estimator where none are chosen."""
+    network = scenario.network if settings.network is None else settings.network
+    if network is None:
+        if settings.estimator is not None:
+            name = settings.estimator if isinstance(settings.estimator, str) else settings.estimator.name
+            raise ValueError(
+                f"estimator: {name!r} makes estimates from messages, and there is no network: choose one, e.g. "
+                "network='wifi'"
+            )
+        return settings, Proximal(settings.order, settings.threads)
+    estimator = settings.estimator or scenario.estimator
+    chosen = dataclasses.replace(settings, network=network, estimator=estimator)
+    return chosen, Networked(network, estimator)
 
 
 def _chosen_scenario(scenario_or_name: Scenario | str | Path) -> Scenario:

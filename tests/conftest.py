@@ -75,6 +75,7 @@ SLOW = tuple(
         "benchmarks/test_benchmark.py::test_every_promised_figure_is_printed",
         "env/test_contract.py::test_the_public_checks_pass",
         "env/test_contract.py::test_300_steps",
+        "env/test_networked_environments.py::test_the_public_checks_pass",
         "observers/test_funnel_kept.py",
         "observers/test_theorems.py",
         "results/test_report.py::TestFloatingPoint",

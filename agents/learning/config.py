@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.learning.fingerprint import plain
+from khop_env.network import Network
 from khop_env.registry import Environment, find_task
 from khop_env.scenarios import Scenario
 from khop_env.simulation import OBSERVE, Observe
@@ -112,4 +113,7 @@ class TrainingConfig:
         name = self.scenario.name if isinstance(self.scenario, Scenario) else self.scenario and str(self.scenario)
         environment = self.environment if isinstance(self.environment, str) else find_task(self.environment).name
         changed = {"environment": environment, "scenario": name, "hidden": list(self.hidden)}
-        return {**values, **changed, "arguments": plain(self.arguments)}
+        arguments = dict(self.arguments)
+        if isinstance(network := arguments.get("network"), Network):  # as a file can say it
+            arguments["network"] = {key: value for key, value in vars(network).items() if value is not None}
+        return {**values, **changed, "arguments": plain(arguments)}

@@ -13,7 +13,8 @@ from khop_env.env import BatchedEnv
 from khop_env.scenarios import Scenario
 from khop_env.tasks import Task
 
-_IRRELEVANT = ("name", "description", "law", "duration", "dt", "order", "figure_agent")  # fields of a scenario
+# fields of a scenario; its network is in the settings, where an environment's own replaces it
+_IRRELEVANT = ("name", "description", "law", "duration", "dt", "order", "network", "estimator", "figure_agent")
 _LISTED = 3  # differences
 
 

@@ -74,7 +74,7 @@ class LearnedPolicy:
             )
             raise PolicyFileError(
                 f"it was trained on {where} with {len(self.columns)} observation columns; this environment has "
-                f"{len(columns)}: {differs}; train a policy for it, or create it with the same scenario and bounds"
+                f"{len(columns)}: {differs}; {_advice(self.columns, columns)}"
             )
         types = {model.type for model in env.models.values()}
         if "" not in self.networks and (missing := types - set(self.networks)):
@@ -188,3 +188,11 @@ def _shipped() -> str:
 def columns_of(env: EnvDescription) -> tuple[str, ...]:
     """Column names of uniform observations, from the agent with most slots."""
     return max(env.layouts.values(), key=lambda layout: len(layout.slots)).names
+
+
+def _advice(own: Sequence[str], here: Sequence[str]) -> str:
+    """What to do about other columns; ages are observed under a network only."""
+    networked, here_too = ("slot0.age" in names for names in (own, here))
+    if networked != here_too:
+        return f"train a policy for it, or create it with{'' if networked else 'out'} a network"
+    return "train a policy for it, or create it with the same scenario and bounds"

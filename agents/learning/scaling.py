@@ -14,18 +14,20 @@ from khop_env.env.layout import Float32Array
 from khop_env.tasks.edges import axis_names
 
 METRE = 0.5  # lengths are in units of 2 m, speeds in units of 2 m/s
+SECOND = 2.0  # ages of information are in units of 0.5 s
 RATE = 0.25  # rates of change of positions are in units of 4 m/s
 MOST = 10.0  # features are clipped to this magnitude: agents under early policies move far away
+_SCALES = {"m": METRE, "m/s": METRE, "s": SECOND}
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationScaler:
     """Computes features of uniform observations: scaled columns, and rates of change of positions.
 
-    Each slot is multiplied by its validity, and agents with a heading get others' positions and displacements in their
-    own frame, in which their inputs act. Scales are constants, not running statistics, which agents under early
-    policies, far away, would distort. Rates are differences to the previous observation: they indicate the velocity of
-    agents whose state doesn't contain it, as far as estimates allow.
+    Each slot is multiplied by its validity, and its rates also by its validity one observation earlier. Agents with a
+    heading get others' positions and displacements in their own frame, in which their inputs act. Scales are constants,
+    not running statistics, which agents under early policies, far away, would distort. Rates are differences to the
+    previous observation: they indicate the velocity of agents whose state doesn't contain it, if estimates are good.
 
     Attributes:
         scale: (D,) factor of each column.
@@ -58,7 +60,7 @@ class ObservationScaler:
         """
         layouts = list(env.layouts.values())
         units = zip(*([field.unit for field in layout.fields] for layout in layouts), strict=True)
-        scale = np.array([min(METRE if unit in ("m", "m/s") else 1.0 for unit in each) for each in units], np.float32)
+        scale = np.array([next((_SCALES[u] for u in each if u in _SCALES), 1.0) for each in units], np.float32)
         names = max(layouts, key=lambda layout: len(layout.slots)).names
         valid = np.full(len(names), len(names))
         for column, name in enumerate(names):
@@ -105,6 +107,9 @@ class ObservationScaler:
         counts = np.concatenate([observations, np.ones((*shape, 1), np.float32)], axis=-1) > 0.5
         features[..., :columns] *= counts[..., self.valid]
         features[..., columns:] *= counts[..., self.valid[self.moving]]
+        if before is not None:  # under a network slots become valid when something arrives, which is no motion
+            known = np.concatenate([before, np.ones((*shape, 1), np.float32)], axis=-1) > 0.5
+            features[..., columns:] *= known[..., self.valid[self.moving]]
         if len(self.planar):
             turned = observations[..., self.headed].any(axis=-1, keepdims=True)
             cos = np.where(turned, observations[..., [self.heading[0]]], np.float32(1.0))

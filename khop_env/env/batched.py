@@ -15,7 +15,7 @@ from khop_env.env.actions import ActionReader
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.layout import Float32Array, ObservationLayout
 from khop_env.env.options import seeds
-from khop_env.env.readout import Sources
+from khop_env.env.readout import Sources, summarize
 from khop_env.env.settings import Settings
 from khop_env.env.state import EnvState, Infos, Step, signature
 from khop_env.observers import FloatArray, IntArray
@@ -71,6 +71,7 @@ class BatchedEnv:
         self.agents = tuple(self.fleet.ids[i] for i in members)
         observed = ObservationColumns(
             self.world,
+            simulator.observers,
             self.task,
             members,
             observe=settings.observe,
@@ -89,13 +90,16 @@ class BatchedEnv:
         self._driven = np.flatnonzero(~acting)
         self._limit = self.fleet.input_limit[:, None]
         self._scale = np.where(np.isfinite(self._limit), self._limit, 1.0)
-        pairs = len(state.memory["estimate"]) if self._read_observations.uses_bounds else 0
+        observers = simulator.observers
+        bounded = len(state.memory["estimate"]) if self._read_observations.uses_bounds else 0
+        known = 4 * observers.layout.pairs if observers.by_messages else 0
         self._sources = Sources(
             state.x,
             state.memory["estimate"],
-            np.zeros((pairs, self.num_envs)),
+            np.zeros((bounded, self.num_envs)),
             inputs,
             np.zeros((self._read_observations.task_rows, self.num_envs)),
+            np.zeros((known, self.num_envs)),
         )
         self._parts = simulator.parts_of(settings.control_period / settings.substeps)
         self._command, self._physical = np.zeros_like(inputs), np.zeros_like(inputs)
@@ -107,6 +111,8 @@ class BatchedEnv:
     def __str__(self) -> str:
         act = "" if len(self.agents) == len(self.fleet) else f", of which {len(self.agents)} act"
         made = f"{self.task.environment} on {self.scenario!r}{act}: {self.simulator.design}"
+        if self.simulator.observers.by_messages:
+            made += f", {self.simulator.observers!r}"
         return f"{made}; observe={self.settings.observe!r}, num_envs={self.num_envs}, {spread(self.world.t)}"
 
     def __repr__(self) -> str:
@@ -239,7 +245,7 @@ class BatchedEnv:
 
     @functools.cached_property
     def _signature(self) -> dict[str, tuple[str, ...]]:
-        return signature(self.task, self.world, self.settings, self.simulator.disturbance)
+        return signature(self.task, self.world, self.settings, self.simulator.disturbance, self.simulator.observers)
 
     def _generator(self, b: int, seed: int | None) -> np.random.Generator:
         own = self._generators[b]
@@ -282,8 +288,11 @@ class BatchedEnv:
     def _observe(self) -> tuple[Float32Array, IntArray]:
         """Observations, and the number of clipped entries of each agent's."""
         sources, clipped = self._sources, np.zeros((self.num_envs, len(self.agents)), np.int64)
+        observers, state = self.simulator.observers, self.simulator.state
         if sources.bound.size:
-            self.simulator.observers.bound(self.simulator.state, sources.bound)
+            observers.bound(state, sources.bound)
+        if sources.known.size:
+            summarize(*observers.information(state), state.t, self.settings.control_period, sources.known)
         if sources.task.size:
             self.task.observe(self.world, sources.task)
         flat = self._read_observations(sources, clipped)

@@ -8,21 +8,26 @@ import numpy as np
 
 from khop_env.env.layout import Feature, Field, ObservationLayout, Slot, features, slots_of
 from khop_env.env.readout import (
+    AGE,
     BOUND,
     ESTIMATE,
     ESTIMATE_COS,
     ESTIMATE_RELATIVE,
     ESTIMATE_SIN,
+    HEARD,
+    HOPS,
     INPUT,
+    KNOWN,
     STATE,
     STATE_COS,
     STATE_RELATIVE,
     STATE_SIN,
     TASK,
+    VALID,
     Column,
     Readout,
 )
-from khop_env.observers import IntArray
+from khop_env.observers import IntArray, Observers
 from khop_env.physics import Fleet
 from khop_env.simulation import Observe
 from khop_env.tasks import Column as TaskColumn
@@ -37,10 +42,12 @@ class ObservationColumns:
     """The observations of the agents that act.
 
     Args:
-        world: fleet and observers.
+        world: fleet and design of the observers.
+        observers: where estimates are, and whether they are all that an agent knows of others.
         task: bound to the fleet; its edges order the slots, and it may add columns.
         agents: the agents that observe, by index.
-        observe: content of the slots of k-hop targets: their estimates, their true states, or zeros.
+        observe: content of the slots of agents that are estimated: their estimates, their true states, or zeros for
+            those that aren't neighbours.
         bounds: whether slots hold the guaranteed bound on the estimate's error.
         uniform: True for the same columns for every agent, padded; False for each agent's own columns.
         inputs: whether an agent observes its input in force, which an actuator may make a state.
@@ -54,6 +61,7 @@ class ObservationColumns:
     def __init__(
         self,
         world: World,
+        observers: Observers,
         task: Task,
         agents: Sequence[int],
         *,
@@ -64,6 +72,7 @@ class ObservationColumns:
     ) -> None:
         design = world.design
         self._world, self._task, self._design, self._fleet, self._observe = world, task, design, design.fleet, observe
+        self._layout, self._by_messages = observers.layout, observers.by_messages
         self._bounds, self._uniform, self._limit, self._inputs = bounds, uniform, world.limit, inputs
         models = self._fleet.models
         self._types = list(dict.fromkeys(model.type for model in models))
@@ -117,20 +126,17 @@ class ObservationColumns:
 
     def _slot(self, i: int, number: int, slot: Slot) -> list[Column]:
         fleet, name, model = self._fleet, f"slot{number}", self._fleet.models[slot.agent]
+        estimated = self._by_messages or not slot.heard  # otherwise its state is received
+        estimate = estimated and self._observe != "oracle"
         columns = [
-            _flag(f"{name}.valid", True),
-            _flag(f"{name}.heard", slot.heard),
-            Column(Field(f"{name}.hops", "", 0.0, float(self._design.k)), value=float(slot.hops)),
+            *self._known_columns(i, name, slot, estimate),
             _flag(f"{name}.task_edge", slot.task_edge),
             *(self._type(name, model.type) if len(self._types) > 1 else ()),
         ]
         columns += [_from_task(f"{name}.", column) for column in self._task.slot_columns(self._world, i, slot.agent)]
-        estimated = not slot.heard and self._observe == "estimate"
-        origin = int(fleet.state_offset[slot.agent])
-        if estimated:
-            origin = self._design.states.layout.slot[i, slot.agent]
+        origin = self._layout.slot[i, slot.agent] if estimate else int(fleet.state_offset[slot.agent])
         position, rest = features(model)
-        relative = ESTIMATE_RELATIVE if estimated else STATE_RELATIVE
+        relative = ESTIMATE_RELATIVE if estimate else STATE_RELATIVE
         columns += [
             Column(
                 Field(f"{name}.position.{axis}", feature.unit, -2.0 * self._limit, 2.0 * self._limit),
@@ -141,28 +147,46 @@ class ObservationColumns:
             for axis, feature, own in zip(self._axes, position, fleet.position_index[i], strict=True)
         ]
         columns += [
-            _state(name, feature, (_ESTIMATE if estimated else _STATE)[feature.how], origin, self._limit)
+            _state(name, feature, (_ESTIMATE if estimate else _STATE)[feature.how], origin, self._limit)
             for feature in rest
         ]
         columns += self._padding(name, self._most_rest - len(rest))
         if self._bounds:
-            columns += self._bound_columns(i, name, slot)
+            columns += self._bound_columns(i, name, slot, estimated)
         if self._observe == "local" and not slot.heard:
             return [Column(column.field) for column in columns]
         return columns
 
-    def _bound_columns(self, i: int, name: str, slot: Slot) -> list[Column]:
-        """Bounds in the order of the state: position, then the rest; 0 for neighbours, whose states are received."""
+    def _known_columns(self, i: int, name: str, slot: Slot, estimate: bool) -> list[Column]:
+        """Whether, when and over how many links something has arrived about the agent: constants without messages."""
+        if not self._by_messages:
+            hops = Column(Field(f"{name}.hops", "", 0.0, float(self._design.k)), value=float(slot.hops))
+            return [_flag(f"{name}.valid", True), _flag(f"{name}.heard", slot.heard), hops]
+        layout, most_hops = self._layout, float(max(self._design.k, len(self._fleet) - 1))  # detours are possible
+        pair = int(layout.column_pair[layout.slot[i, slot.agent]])
+        valid, *others = (
+            Column(Field(f"{name}.{quantity}", unit, 0.0, high), KNOWN, number * layout.pairs + pair)
+            for quantity, unit, high, number in (
+                ("valid", "", 1.0, VALID),
+                ("heard", "", 1.0, HEARD),
+                ("hops", "", most_hops, HOPS),
+                ("age", "s", self._limit, AGE),
+            )
+        )
+        return [valid if estimate else _flag(f"{name}.valid", True), *others]
+
+    def _bound_columns(self, i: int, name: str, slot: Slot, estimated: bool) -> list[Column]:
+        """Bounds in the order of the state: position, then the rest; 0 where the state itself is received."""
         model = self._fleet.models[slot.agent]
         states, position = list(model.states.items()), model.position_index.tolist()
         columns = []
         for component in [*position, *(c for c in range(model.n) if c not in position)]:
             state, unit = states[component]
             field = Field(f"{name}.bound.{state}", unit, 0.0, self._largest_bound)
-            if slot.heard:
-                columns.append(Column(field))
+            if estimated:
+                columns.append(Column(field, BOUND, self._layout.slot[i, slot.agent] + component))
             else:
-                columns.append(Column(field, BOUND, self._design.states.layout.slot[i, slot.agent] + component))
+                columns.append(Column(field))
         return columns + self._padding(f"{name}.bound", self._most_states - model.n)
 
     def _type(self, name: str, kind: str) -> list[Column]:

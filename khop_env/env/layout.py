@@ -43,7 +43,8 @@ class Slot:
     Attributes:
         agent: its index in the fleet.
         id: its id.
-        heard: whether it is a neighbour (1 hop), whose state is received; otherwise its state is estimated.
+        heard: whether it is a neighbour (1 hop), whose state is received; otherwise its state is estimated. Under a
+            network neighbours are estimated, too, from their messages.
         hops: distance in the communication graph, from it to the observing agent.
         task_edge: whether the observing agent's task has an edge to it.
     """

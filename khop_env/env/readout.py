@@ -12,9 +12,12 @@ from khop_env.compiled import compiled
 from khop_env.env.layout import Field, Float32Array
 from khop_env.observers import FloatArray, IntArray
 
-# sources of a column's value: none, states, estimates, their guaranteed bounds, inputs, the task's own rows
+# sources of a column's value: none, states, estimates, their guaranteed bounds, inputs, the task's own rows, and
+# what is known of the messages that an estimate rests on
 CONSTANT, STATE, STATE_COS, STATE_SIN, STATE_RELATIVE = range(5)
-ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, BOUND, INPUT, TASK = range(5, 12)
+ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, BOUND, INPUT, TASK, KNOWN = range(5, 13)
+# quantities of a column KNOWN, whose row is quantity * pairs + pair
+VALID, HEARD, HOPS, AGE = range(4)
 _TILE = 32  # number of environments whose values of a column are computed before they are written
 
 
@@ -25,7 +28,7 @@ class Column:
     Attributes:
         field: name, unit and bounds.
         kind: CONSTANT, STATE, ...
-        row: of the states, estimates, bounds, inputs or task values that it reads.
+        row: of the states, estimates, bounds, inputs, task values or known quantities that it reads.
         origin: the row of the states that a relative position is taken from, or -1.
         value: of a constant.
         clip: smallest and largest value, if narrower than the field's: where agents of several types share one space.
@@ -53,6 +56,7 @@ class Sources(NamedTuple):
         bound: (P, B) guaranteed bounds on their errors; not read unless `Readout.uses_bounds`.
         inputs: (m, B) inputs in force, as fractions of their limits.
         task: (rows, B) values of the task's live columns.
+        known: (4 pairs, B) the quantities that `summarize` writes, of observers that exchange messages; else no rows.
     """
 
     x: FloatArray
@@ -60,6 +64,7 @@ class Sources(NamedTuple):
     bound: FloatArray
     inputs: FloatArray
     task: FloatArray
+    known: FloatArray
 
 
 class _LiveColumns(NamedTuple):
@@ -150,6 +155,9 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
             elif kind == TASK:
                 for e in range(width):
                     values[e] = sources.task[row, first + e]
+            elif kind == KNOWN:
+                for e in range(width):
+                    values[e] = sources.known[row, first + e]
             elif kind == STATE_COS:
                 for e in range(width):
                     values[e] = np.cos(x[row, first + e])
@@ -172,3 +180,29 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
                 values[e] = min(max(values[e], low), high)
             for e in range(width):
                 out[first + e, column] = values[e]
+
+
+@compiled
+def summarize(
+    age: FloatArray, hops: FloatArray, since: FloatArray, t: FloatArray, period: float, out: FloatArray
+) -> None:
+    """Write what agents know of the information that their estimates rest on, from `observers.Information`.
+
+    Args:
+        age: (pairs, B) time since the newest state that has arrived was measured, in s; inf where none has.
+        hops: (pairs, B) links over which it came.
+        since: (pairs, B) time since it arrived, in s.
+        t: (B,) time since reset in s.
+        period: the control period in s.
+        out: (4 pairs, B) overwritten: VALID, whether anything has arrived; HEARD, whether something newer has within
+            the last control period; HOPS; AGE in s, and where nothing has arrived the time since reset.
+    """
+    pairs = age.shape[0]
+    recent = period * (1.0 - 1e-6)  # what arrived with the observation before is a whole period old, but for rounding
+    for q in range(pairs):
+        for e in range(t.size):
+            valid = age[q, e] < np.inf
+            out[VALID * pairs + q, e] = valid
+            out[HEARD * pairs + q, e] = since[q, e] < recent
+            out[HOPS * pairs + q, e] = hops[q, e]
+            out[AGE * pairs + q, e] = age[q, e] if valid else t[e]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
 
 from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
+from khop_env.network import Network
+from khop_env.observers import Estimator, as_estimator
 from khop_env.observers.proximal import MOST_THREADS
 from khop_env.physics import did_you_mean
 from khop_env.simulation import OBSERVE, Observe
@@ -21,8 +24,8 @@ class Settings:
 
     Attributes:
         observe: content of the slots of k-hop targets: their "estimate", their true states ("oracle"), or zeros
-            ("local").
-        bounds: whether slots also hold the guaranteed bound delta(t) on the estimate's error.
+            ("local"). Under a network neighbours are estimated, too, except with "oracle".
+        bounds: whether slots also hold the guaranteed bound on the estimate's error.
         uniform: True for one padded Box for all agents, False for a Box without padding for each agent.
         max_cycles: control periods after which an episode is truncated.
         control_period: time between actions in s.
@@ -30,8 +33,14 @@ class Settings:
         order: of the simulator's step, 1 or 2. Actions are held over a control period, so that the closed loop is of
             order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time.
         actuator: "direct", "lag", "slew", "hold", or an `Actuator`.
-        limit: bound on positions and other states in observations, in their own units; values beyond are clipped.
+        limit: bound on positions and other states in observations, in their own units, and on ages in s; values beyond
+            are clipped.
         threads: of the observers' solve.
+        network: how messages are exchanged: a profile's name, also with other values as in "lossy:period=0.1,loss=0.3",
+            a `Network` or a mapping of its values; None for the scenario's own, which by default is none: exchange in
+            continuous time.
+        estimator: from messages to estimates under a network: "ppso" for the paper's observers, "relay" for stamped
+            states that are passed on, or an `Estimator`; None for the scenario's own, "ppso" by default.
 
     Raises:
         ValueError: for an argument out of range; the message names it, its value and the valid range.
@@ -47,6 +56,8 @@ class Settings:
     actuator: str | Actuator = "direct"
     limit: float = 100.0
     threads: int = 1
+    network: str | Network | Mapping[str, object] | None = None
+    estimator: str | Estimator | None = None
 
     def __post_init__(self) -> None:
         if self.observe not in OBSERVE:
@@ -74,6 +85,9 @@ class Settings:
                 "control_period must be from 1e-9 to 1e9 s, and at most a million simulator steps; got "
                 f"control_period = {self.control_period:g} s" + ("" if self.dt is None else f" and dt = {self.dt:g} s")
             )
+        object.__setattr__(self, "network", Network.of(self.network))
+        if self.estimator is not None:
+            as_estimator(self.estimator)  # raises for an unknown name
         object.__setattr__(self, "actuator", as_actuator(self.actuator))
         substeps = self.substeps  # refuses a period that isn't a whole number of steps
         if isinstance(self.actuator, Hold) and substeps == 1:
@@ -119,3 +133,5 @@ class SettingsArguments(TypedDict, total=False):
     actuator: str | Actuator
     limit: float
     threads: int
+    network: str | Network | Mapping[str, object] | None
+    estimator: str | Estimator | None

@@ -13,7 +13,7 @@ from khop_env.brief import brief
 from khop_env.env.actuators import described
 from khop_env.env.layout import Float32Array
 from khop_env.env.settings import Settings
-from khop_env.observers import FloatArray, IntArray
+from khop_env.observers import FloatArray, IntArray, Networked, Observers
 from khop_env.physics import Disturbance
 from khop_env.simulation import SimulatorState
 from khop_env.tasks import Task, World
@@ -26,7 +26,7 @@ SHARED_INFOS = (
 )
 """Keys of every info beside the task's own: the largest |xi| / rho, and error over the observer's own bound, of all
 observers of states and inputs since the last action, below 1 by guarantee; entries of this agent's observation and
-action that were clipped."""
+action that were clipped. Under a network the bound is the certified one, neighbours' states included."""
 
 Infos = dict[str, NDArray[Any]]
 Step = tuple[Float32Array, FloatArray, NDArray[np.bool_], NDArray[np.bool_], Infos]
@@ -74,16 +74,19 @@ class EnvState:
 
 
 def signature(
-    task: Task, world: World, settings: Settings, disturbance: Disturbance | None
+    task: Task, world: World, settings: Settings, disturbance: Disturbance | None, observers: Observers
 ) -> dict[str, tuple[str, ...]]:
     """Properties, in words, that two environments must have in common to continue from each other's state."""
     design = world.design
+    networked = observers if isinstance(observers, Networked) else None
     steps = f"{settings.control_period:g} s in {settings.substeps} steps of order {settings.order}"
     bounds = dict.fromkeys(described(bound) for bound in (*design.states.bounds, *design.inputs.bounds))
     return {
         **task.signature(world),
         "actuators": (described(settings.actuator),),
         "control periods": (steps,),
+        "networks": ("none" if networked is None else described(networked.network),),
+        "estimators": () if networked is None else (networked.estimator.name,),
         "disturbances": ("none" if disturbance is None else described(disturbance),),
         "bounds": tuple(bounds),
         "design rules": (design.states.rule,),

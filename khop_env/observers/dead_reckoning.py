@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -65,13 +66,12 @@ def extended_drift(model: AgentModel, growth: Growth | None) -> Callable[[FloatA
     """The drift (t, x) of predictions: the model's, and outside the region of its `growth` what that says."""
     if growth is None or not np.isfinite(growth.region).any():
         return model.drift
-    low, high = -growth.region, growth.region
+    return functools.partial(_extended, model, growth)  # a closure couldn't be pickled
 
-    def extended(t: FloatArray, x: FloatArray) -> FloatArray:
-        inside = np.minimum(np.maximum(x, low), high)
-        return growth.extended(model.drift(t, inside), x, inside)
 
-    return extended
+def _extended(model: AgentModel, growth: Growth, t: FloatArray, x: FloatArray) -> FloatArray:
+    inside = np.minimum(np.maximum(x, -growth.region), growth.region)
+    return growth.extended(model.drift(t, inside), x, inside)
 
 
 def integrated(

@@ -12,10 +12,11 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Array, Table
 
-from khop_env.network import SCHEDULES
-from khop_env.observers import Bound, Exponential
+from khop_env.network import PROFILES, SCHEDULES
+from khop_env.observers import ESTIMATORS, Bound, Exponential
 from khop_env.observers.design import design_rule_for
 from khop_env.physics import DISTURBANCES, MODELS, AgentModel, Term
+from khop_env.scenarios.network_table import write_network
 from khop_env.scenarios.scenario import Scenario
 from khop_env.scenarios.schedules import schedule_table
 
@@ -111,6 +112,15 @@ def write_scenario(scenario: Scenario) -> str:
             terms,
             f"Disturbances, which add up. Kinds: {', '.join(DISTURBANCES)}. amplitude bounds each component of |w|, in",
             'state units per s. agents = "TYPE", an id like "TYPE_0", or a list of these, picks those that it acts on.',
+        )
+    if (network := write_network(scenario)) is not None:
+        _section(
+            document,
+            "network",
+            network,
+            "Messages: every agent sends one each period; each link loses it, or delivers it with a delay. Instead of",
+            f"numbers, or beside them: profile = one of {', '.join(PROFILES)}.",
+            f"Estimators: {', '.join(ESTIMATORS)}. Without this table exchange is continuous.",
         )
     law = tomlkit.table()
     law.update(_plain({"name": scenario.law.name, **scenario.law.parameters}))

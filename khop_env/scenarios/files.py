@@ -25,6 +25,7 @@ from khop_env.physics import (
 )
 from khop_env.scenarios.checked import REQUIRED, CheckedTable, NotedError, ScenarioFileError, abbreviated, fits
 from khop_env.scenarios.export import write_scenario
+from khop_env.scenarios.network_table import read_network
 from khop_env.scenarios.scenario import MOST_AGENTS, Bounds, LawChoice, Scenario
 from khop_env.scenarios.schedules import read_schedule
 
@@ -95,6 +96,9 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
         values["schedule"] = read_schedule(root.tables("schedule", []))
     with root.gathering():
         values["law"] = _law(root.table("law", {"name": "tanh"}), laws)
+    if "network" in root.names():
+        with root.gathering():
+            values |= read_network(root.table("network"))
     if "models" not in values:  # nothing below can be read without models
         with root.gathering():
             root.finish()

@@ -12,20 +12,23 @@ import networkx as nx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.network import Schedule
+from khop_env.network import Network, Schedule
 from khop_env.observers import (
     Bound,
-    DesignError,
     DesignRule,
+    Estimator,
     Exponential,
+    Networked,
     ObserverDesign,
     Observers,
     PerformanceFunction,
     Proximal,
     TargetObservers,
+    as_estimator,
 )
 from khop_env.observers.design import design_rule_for
 from khop_env.physics import AgentModel, Disturbance, Fleet, Links, check_task_graph, did_you_mean, validate_graph
+from khop_env.scenarios.bounds import check_bound, widened
 from khop_env.simulation import InitialSet, Law, Observe, Simulator
 
 MOST_AGENTS = 100_000
@@ -71,6 +74,8 @@ class Scenario:
         duration: length of an experiment in s.
         dt: step in s.
         order: of the proximal step.
+        network: how messages are exchanged, also by name ("wifi") or as a mapping; None: exchange in continuous time.
+        estimator: from messages to estimates under a network, "ppso" or "relay", or an `Estimator`.
         figure_agent: index of the agent whose estimates figures show; None for the agent with most observers.
 
     Raises:
@@ -96,6 +101,8 @@ class Scenario:
     duration: float = 10.0
     dt: float = 0.01
     order: int = 2
+    network: Network | str | Mapping[str, object] | None = None
+    estimator: str | Estimator = "ppso"
     figure_agent: int | None = None
 
     def __post_init__(self) -> None:
@@ -108,6 +115,8 @@ class Scenario:
             object.__setattr__(self, "schedule", Schedule.of(self.schedule))
             if self.schedule is not None:
                 self.schedule.bind(Links.of(self.communication), self.fleet.position_index)
+            object.__setattr__(self, "network", Network.of(self.network))
+            as_estimator(self.estimator)  # raises for an unknown name
         except ValueError as error:
             raise ValueError(f"scenario {self.name!r}: {error}") from None
         object.__setattr__(self, "task", check_task_graph(self.task, self.communication, self.k))
@@ -158,9 +167,11 @@ class Scenario:
 
     def __repr__(self) -> str:
         edges = f"{self.communication.number_of_edges()} communication and {self.task.number_of_edges()} task edges"
+        network = Network.of(self.network)
+        messages = "" if network is None else f", {network.described()}"
         return (
-            f"Scenario({self.name!r}: {self.fleet}; k={self.k}, {edges}; law {self.law.name!r}, {self.duration:g} s in "
-            f"steps of {self.dt:g} s)"
+            f"Scenario({self.name!r}: {self.fleet}; k={self.k}, {edges}{messages}; law {self.law.name!r}, "
+            f"{self.duration:g} s in steps of {self.dt:g} s)"
         )
 
     def replace(self, **changes: Any) -> Scenario:
@@ -216,7 +227,7 @@ class Scenario:
         )
         for name, funnels in (("delta", design.states), ("theta", design.inputs)):
             for bound in {id(f): f for f in funnels.bounds if not isinstance(f, Exponential)}.values():
-                _check_bound(bound, name)
+                check_bound(bound, name)
         return design
 
     def sized(self, margin: float = 1.25) -> Scenario:
@@ -246,12 +257,12 @@ class Scenario:
             present = funnels.delta.evaluate(np.zeros(1), np.empty((len(needed), 1)))[:, 0]
             needed = np.where(np.isfinite(needed), needed, present)  # an unbounded g needs an infinite theta(0)
             if not isinstance(bounds, Mapping):
-                resized[name] = _widened(bounds, needed.max(initial=0.0))
+                resized[name] = widened(bounds, needed.max(initial=0.0))
                 continue
             agent_type = np.array([self.models[i].type for i in funnels.layout.target])[funnels.layout.row_target]
             resized[name] = {
                 kind: [
-                    _widened(function, needed[agent_type == kind].reshape(-1, n)[:, c].max(initial=0.0))
+                    widened(function, needed[agent_type == kind].reshape(-1, n)[:, c].max(initial=0.0))
                     for c, function in enumerate(bound if isinstance(bound, Sequence) else [bound] * n)
                 ]
                 for kind, bound in bounds.items()
@@ -275,13 +286,16 @@ class Scenario:
         Args:
             law: feedback law, e.g. `agents.make_law(scenario.law)`; None to pass inputs to `Simulator.step`.
             observe: source of the states of k-hop targets in the law's view, as in `Simulator`.
-            observers: realisation of the observers; `Proximal` of the scenario's `order` by default.
+            observers: realisation of the observers; by default that of the scenario's `network` and `estimator`, or
+                without a network `Proximal` of its `order`.
             num_envs: number of environments B.
 
         Raises:
             ValueError: for more environments than `MOST_NUMBERS` states and estimates allow.
         """
-        width = self.fleet.n + self.design.states.layout.size + self.design.inputs.layout.size
+        realisation = observers or self._realisation()
+        estimated = self.design.knowledge if realisation.by_messages else self.design.states.layout
+        width = self.fleet.n + estimated.size + self.design.inputs.layout.size
         if num_envs * width > MOST_NUMBERS:
             raise ValueError(
                 f"{num_envs} environments of {self.name!r} have {num_envs * width:.3g} states and estimates; take "
@@ -294,9 +308,12 @@ class Scenario:
             law=law,
             task=self.task,
             observe=observe,
-            observers=observers or Proximal(self.order),
+            observers=realisation,
             num_envs=num_envs,
         )
+
+    def _realisation(self) -> Observers:
+        return Proximal(self.order) if self.network is None else Networked(self.network, self.estimator)
 
     def _per_agent(self, bounds: Bounds, name: str) -> PerformanceFunction | dict[int, Bound]:
         if not isinstance(bounds, Mapping):
@@ -325,31 +342,3 @@ def number_of_steps(duration: float, dt: float) -> int:
             f"are the most; take dt of {duration / MOST_STEPS:.2g} s or more, or a shorter duration"
         )
     return max(1, math.ceil(duration / dt - 1e-9))
-
-
-_SAMPLED_TIMES = np.concatenate([np.linspace(0.0, 10.0, 1001), np.geomspace(10.0, 1000.0, 1001)])  # s
-
-
-def _check_bound(bound: PerformanceFunction, name: str) -> None:
-    """Sample a user's performance function: positive and finite, and not below the infimum that it declares.
-
-    Raises:
-        DesignError: if it isn't; the message has the time and the value.
-    """
-    values = np.broadcast_to(np.asarray(bound(_SAMPLED_TIMES), dtype=float), _SAMPLED_TIMES.shape)
-    floor = float(bound.infimum())
-    if not 0.0 < floor < math.inf:
-        raise DesignError(f"{name}: {bound!r}.infimum() must be positive and finite; got {floor!r}")
-    wrong = np.flatnonzero(~(np.isfinite(values) & (values >= floor * (1.0 - 1e-9))))
-    if wrong.size:
-        t, value = _SAMPLED_TIMES[wrong[0]], values[wrong[0]]
-        raise DesignError(
-            f"{name}: {bound!r} is {value:.6g} at t = {t:.4g} s, but its infimum() says that it is never below "
-            f"{floor:.6g}; return a lower bound on all its values, which have to be finite and positive (Definition 1)"
-        )
-
-
-def _widened(bound: PerformanceFunction, initial: float) -> Exponential:
-    if not isinstance(bound, Exponential):
-        raise ValueError(f"only Exponential bounds can be sized; got {bound!r}")
-    return Exponential(max(float(initial), bound.final), bound.final, bound.rate)

@@ -20,6 +20,7 @@ _CHECKS: dict[str, Callable[[Subject], str | None]] = {
     "memory": runs.memory,
     "pickle": runs.pickled,
     "deepcopy": runs.deepcopied,
+    "restore": runs.restored,
     "episode_end": values.episode_end,
     "nan_action": values.nan_action,
     "views": views.views,

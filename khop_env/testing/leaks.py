@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import networkx as nx
 import numpy as np
+from numpy.typing import NDArray
 
 from khop_env.env import EnvState, KHopEnv
+from khop_env.observers import IntArray, Networked, PairLayout
 from khop_env.testing.equality import difference
 from khop_env.testing.subject import Fault, Subject, called, play
+from khop_env.testing.views import copies
 
 _VISIBLE = ("t", "x", "estimate")  # the parts of the simulator's state that observations may depend on
+_OF_PAIRS = ("bound", "stamp", "hops", "arrived")  # and under a network what an agent knows of its own estimates
+_LOSS = 0.5  # of messages, so that about half of an agent's neighbours don't get its next one
 
 
 def leak(subject: Subject) -> None:
@@ -22,27 +29,79 @@ def leak(subject: Subject) -> None:
         for agent, observation in step["observations"].items():
             if found := difference(observation, env.observe(agent), f"observations[{agent!r}]"):
                 raise Fault(f"{called(number, step)} and observe() differ: {found}")
-    fleet, design, mode = env.batched.fleet, env.batched.simulator.design, env.batched.settings.observe
-    hops = dict(nx.all_pairs_shortest_path_length(design.communication))
-    reach = design.k if mode == "oracle" else 1
+    fleet, observers, mode = env.batched.fleet, env.batched.simulator.observers, env.batched.settings.observe
+    hops = dict(nx.all_pairs_shortest_path_length(env.batched.simulator.design.communication))
+    direct = 0 if observers.by_messages else 1
+    reach = env.batched.simulator.design.k if mode == "oracle" else direct
     for j, agent in enumerate(fleet.ids):
         near = {i for i in range(len(fleet)) if hops[j].get(i, np.inf) <= reach}
         _require(env, near, f"the true state of {agent!r}", lambda state: state.simulator.x, [fleet.state_slice(j)])
         _require(env, {j}, f"the input in force of {agent!r}", lambda state: state.inputs, [fleet.input_slice(j)])
-        made = [
-            slice(start, start + fleet.models[target].n)
-            for (observer, target), start in design.states.layout.slot.items()
-            if observer == j
-        ]
-        seen_by = {j} if mode == "estimate" else set()
-        _require(env, seen_by, f"an estimate that {agent!r} makes", _array("estimate"), made)
+        made = _rows_of(observers.layout, j)
+        seen_by = set() if mode == "oracle" or (mode == "local" and not observers.by_messages) else {j}
+        _require(env, seen_by, f"an estimate that {agent!r} makes", _array("estimate"), [made[0]])
+        for name in _OF_PAIRS if observers.by_messages else ():
+            _require(env, {j}, f"{agent!r}'s {name}", _array(name), [made[0] if name == "bound" else made[1]])
     for name in env.get_state().simulator.arrays():
-        if name not in _VISIBLE:
+        if name not in _VISIBLE and not (observers.by_messages and name in _OF_PAIRS):
             _require(env, set(), f"the simulator's {name}", _array(name), [...])
+    if isinstance(observers, Networked) and mode != "oracle":
+        _lost_messages(env, observers, subject.seed)
+
+
+def _rows_of(layout: PairLayout, observer: int) -> tuple[IntArray, IntArray]:
+    """Rows of the estimates that an agent makes, and its pairs."""
+    pairs = np.flatnonzero(layout.observer == observer)
+    return np.flatnonzero(np.isin(layout.column_pair, pairs)), pairs
+
+
+def _lost_messages(env: KHopEnv, observers: Networked, seed: int) -> None:
+    """Check that a state that is different for one control period changes observations of those who heard of it only.
+
+    In an environment with many losses, and without disturbances, which may couple agents; what an agent sends gets one
+    hop further a round at most.
+    """
+    lossy = copy.copy(observers)
+    lossy.network = replace(observers.network, loss=_LOSS, burst=None)
+    env = KHopEnv(copies(env, 1, observers=lossy, disturbance=None), name="")
+    for _ in play(env, 4, seed, reset_seed=seed):
+        pass
+    if not env.agents:
+        env.reset()
+    fleet, links, saved = env.batched.fleet, env.batched.simulator.design.links, env.get_state()
+    actions = {agent: np.zeros(env.action_space(agent).shape, np.float32) for agent in env.agents}
+
+    def after(state: EnvState) -> dict[str, Any]:
+        env.set_state(state)
+        return env.step(actions)[0]
+
+    expected = after(saved)
+    first, last = (int(each.simulator.memory["channel.round"][0]) for each in (saved, env.get_state()))
+    newest = env.get_state().simulator.memory["channel.newest"][:, 0]
+    for j, agent in enumerate(fleet.ids):
+        reached = {j}
+        for _ in range(last - first):
+            over = [(links.sender[link], links.receiver[link]) for link in np.flatnonzero(newest > first)]
+            reached |= {int(receiver) for sender, receiver in over if sender in reached}
+        edited = copy.deepcopy(saved)
+        edited.simulator.x[fleet.state_slice(j)] += 0.1
+        for other, observation in after(edited).items():
+            if fleet.agent(other) not in reached and (text := difference(expected[other], observation, "entry")):
+                raise Fault(
+                    f"the true state of {agent!r} changes the next observation of {other!r}, although no message of "
+                    f"it has arrived: {text}"
+                )
 
 
 def _array(name: str) -> Callable[[EnvState], Any]:
     return lambda state: state.simulator.arrays()[name]
+
+
+def _other(values: NDArray[Any]) -> NDArray[Any]:
+    """Values that differ everywhere, far from all estimates."""
+    if values.dtype.kind == "f":
+        return values + 0.7 + 0.1 * np.arange(values.size).reshape(values.shape)
+    return ~values if values.dtype.kind == "b" else values + values.dtype.type(1)
 
 
 def changed_by(env: KHopEnv, write: Callable[[EnvState], None]) -> dict[int, int]:
@@ -75,9 +134,8 @@ def _require(env: KHopEnv, allowed: set[int], text: str, read: Callable[[EnvStat
 
     def write(state: EnvState) -> None:
         for part in parts:
-            array = read(state)[part]
-            change = 0.7 + 0.1 * np.arange(array.size).reshape(array.shape)  # far from all estimates
-            array += change if array.dtype.kind == "f" else (10.0 * change).astype(array.dtype)
+            array = read(state)
+            array[part] = _other(array[part])
 
     ids = env.batched.fleet.ids
     for i, column in changed_by(env, write).items():

@@ -119,6 +119,18 @@ def deepcopied(subject: Subject) -> None:
     _continues(subject, copy.deepcopy)
 
 
+def restored(subject: Subject) -> None:
+    """A saved state is restored bit for bit, in another environment."""
+    env = subject.own()
+
+    def into_another(env: ParallelEnv) -> ParallelEnv:
+        twin = subject.own()
+        twin.set_state(env.get_state())
+        return twin
+
+    _continues(subject, into_another, env)
+
+
 def _survives_writing(subject: Subject) -> None:
     """Check that writing into returned values or actions has no effect."""
     subject.require_repeatable()
@@ -148,10 +160,10 @@ def _spoil(step: dict[str, Any]) -> None:
             value["__all__"] = value.pop(next(iter(value)))
 
 
-def _continues(subject: Subject, method: Callable[[ParallelEnv], ParallelEnv]) -> None:
+def _continues(subject: Subject, method: Callable[[ParallelEnv], ParallelEnv], env: ParallelEnv | None = None) -> None:
     """Compare a copy made in mid-episode with the original, across the end of the episode and unseeded resets."""
     subject.require_repeatable()
-    env = subject.any()
+    env = subject.any() if env is None else env
     for _ in play(env, 4, subject.seed, reset_seed=subject.seed):
         pass
     twin = method(env)

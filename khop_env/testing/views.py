@@ -40,17 +40,11 @@ def views(subject: Subject) -> str:
     return ""
 
 
-def copies(env: KHopEnv, num_envs: int) -> BatchedEnv:
-    """The same environment as a `BatchedEnv` of `num_envs` environments."""
+def copies(env: KHopEnv, num_envs: int, **changes: Any) -> BatchedEnv:
+    """The same environment as a `BatchedEnv` of `num_envs` environments; `changes` are arguments of its `Simulator`."""
     batched, simulator = env.batched, env.batched.simulator
-    many = Simulator(
-        simulator.design,
-        simulator.initial,
-        disturbance=simulator.disturbance,
-        task=simulator.task_graph,
-        observers=simulator.observers,
-        num_envs=num_envs,
-    )
+    arguments = {"disturbance": simulator.disturbance, "observers": simulator.observers, **changes}
+    many = Simulator(simulator.design, simulator.initial, task=simulator.task_graph, num_envs=num_envs, **arguments)
     return BatchedEnv(many, batched.task, batched.settings, batched.scenario)
 
 
