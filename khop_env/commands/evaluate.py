@@ -55,6 +55,7 @@ def evaluate(
     """
     from agents.comparison import compare
     from agents.workers import Interrupted, UnfinishedError
+    from khop_env.objects import split_specs
     from khop_env.registry import find_task
     from khop_env.typed import environment_arguments
 
@@ -72,7 +73,7 @@ def evaluate(
             try:
                 comparison = compare(
                     environment,
-                    split_policies(policies),
+                    split_specs(policies, "--policies", "policy"),
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
                     scenario=chosen,
                     arguments=arguments,
@@ -115,26 +116,6 @@ def _draw(comparison: Comparison, figure: Path) -> None:
     with mistakes(), waiting(f"drawing {figure}"):
         error_over_time(first.time, errors, figure, title, comparison.rows[0].env.error_unit)
     say(f"figure: {figure}")
-
-
-def split_policies(text: str) -> list[str]:
-    """Policies from "tanh,linear:gain=2,cancel_drift=true": a further parameter belongs to the policy before it.
-
-    Raises:
-        ValueError: for no policy, or one named twice.
-    """
-    found: list[str] = []
-    for piece in filter(None, (part.strip() for part in text.split(","))):
-        if "=" in piece and ":" not in piece and found:
-            found[-1] += f",{piece}"
-        else:
-            found.append(piece)
-    if not found:
-        raise ValueError("name at least one policy, e.g. --policies tanh,zero")
-    for spec in found:
-        if found.count(spec) > 1:
-            raise ValueError(f"--policies names {spec!r} twice")
-    return found
 
 
 def print_comparison(comparison: Comparison) -> None:

@@ -7,6 +7,6 @@ environments at once.
 from khop_env.network.channel import Channel, ChannelMemory
 from khop_env.network.link import PlainLink, plain_noise
 from khop_env.network.network import PROFILES, Network
-from khop_env.network.reading import Range, split_networks
+from khop_env.network.reading import Range
 
-__all__ = ["PROFILES", "Channel", "ChannelMemory", "Network", "PlainLink", "Range", "plain_noise", "split_networks"]
+__all__ = ["PROFILES", "Channel", "ChannelMemory", "Network", "PlainLink", "Range", "plain_noise"]
