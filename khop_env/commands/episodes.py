@@ -121,7 +121,7 @@ def continuous(
     law = _law(scenario, controller)
     made = make_law(law)
     longest, stiffest = scenario.longest_step
-    parts_of_step(dt, longest, scenario.fleet.ids[stiffest])
+    parts_of_step(dt, longest, f"the drift of {scenario.fleet.ids[stiffest]!r}")
     observers = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
     simulator = scenario.build(law=made, observe=observe, observers=observers)
     simulator.reset(seed)
