@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import textwrap
 import time
@@ -15,6 +16,7 @@ import typer
 SHOWN_TARGETS = 20
 _SHOWN_IDS = 6  # of a k-hop set
 _PAGE = 80  # columns
+_LONGEST_NAME = 18  # characters in a table; longer ones are folded
 
 _UNSURE = 0.5  # s of work before it is guessed how long it will take
 _LONG = 2.0  # s: work that takes longer gets a progress bar
@@ -117,6 +119,16 @@ def print_table(
         table.add_row(*row)
     total = max(available, sum(widths) + 2 * len(widths))
     Console(width=total, markup=False, highlight=False).print(table)
+
+
+def folded(name: str) -> str:
+    """A long name in several lines, which end at its own separators."""
+    lines = [""]
+    for piece in re.split(r"(?<=[/:,@-])", name):
+        if lines[-1] and len(lines[-1]) + len(piece) > _LONGEST_NAME:
+            lines.append("")
+        lines[-1] += piece
+    return "\n".join(lines)
 
 
 def _narrowed(lengths: Sequence[Sequence[int]], least: Sequence[int], room: int) -> list[int]:

@@ -6,6 +6,7 @@ import enum
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -125,6 +126,20 @@ def find_environment(name: str) -> Task | type[Task] | None:
     return (
         find_task(found) if isinstance(found, Task) or (isinstance(found, type) and issubclass(found, Task)) else None
     )
+
+
+def require_figure(figure: Path | None) -> None:
+    """Refuse a figure that couldn't be written before there is something to lose, and make its folder.
+
+    Raises:
+        ValueError: for a file name of another kind.
+        OSError: if its folder can't be made.
+    """
+    if figure is None:
+        return
+    if figure.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"--figure {figure}: a figure's name ends in .png, .pdf or .svg")
+    figure.parent.mkdir(parents=True, exist_ok=True)
 
 
 def print_json(value: Any) -> None:

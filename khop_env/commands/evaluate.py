@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,13 +16,12 @@ from khop_env.commands.common import (
     load,
     mistakes,
     print_json,
+    require_figure,
 )
-from khop_env.terminal import Progress, print_table, print_text, say, waiting
+from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
 
 if TYPE_CHECKING:
     from agents.comparison import Comparison
-
-_LONGEST_NAME = 18  # characters of a policy in the table; longer names are folded
 
 
 def evaluate(
@@ -63,10 +61,7 @@ def evaluate(
     with mistakes():
         if csv and as_json:
             raise ValueError("--csv and --json: choose one of them")
-        if figure is not None:
-            if figure.suffix.lower() not in (".png", ".pdf", ".svg"):
-                raise ValueError(f"--figure {figure}: a figure's name ends in .png, .pdf or .svg")
-            figure.parent.mkdir(parents=True, exist_ok=True)  # before anything is played that could be lost
+        require_figure(figure)
         arguments = environment_arguments(env, find_task(environment), {"observe": "--observe"})
         chosen = None if scenario is None else load(scenario)
         with Progress(f"playing {environment}") as progress:
@@ -129,7 +124,7 @@ def print_comparison(comparison: Comparison) -> None:
         few = "" if count == comparison.planned else f" ({count} episodes)"
         rows.append(
             (
-                f"{_folded(row.policy)} on {row.observe}{few}",
+                f"{folded(row.policy)} on {row.observe}{few}",
                 _with_interval(seen["mean_return"], seen["ci95"]),
                 _with_interval(more, interval, sign="+") if number else "",
                 f"{seen['final_task_error']:.3g}",
@@ -149,16 +144,6 @@ def print_comparison(comparison: Comparison) -> None:
         "below a tenth of the initial one; effort: mean |u|^2, u in fractions of the limits; |e|: largest |xi| / rho; "
         "e / bound: largest estimation error over its bound (of all observers, below 1 by guarantee)"
     )
-
-
-def _folded(policy: str) -> str:
-    """A long name in several lines, which end at its own separators."""
-    lines = [""]
-    for piece in re.split(r"(?<=[/:,@-])", policy):
-        if lines[-1] and len(lines[-1]) + len(piece) > _LONGEST_NAME:
-            lines.append("")
-        lines[-1] += piece
-    return "\n".join(lines)
 
 
 def _with_interval(value: float, interval: float | None, sign: str = "") -> str:
