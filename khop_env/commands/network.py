@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -26,6 +27,13 @@ if TYPE_CHECKING:
     from khop_env.scenarios import Scenario
 
 
+class MotionOption(enum.StrEnum):
+    """What the law acts on."""
+
+    ESTIMATE = "estimate"
+    ORACLE = "oracle"
+
+
 def network(
     name: ScenarioArgument,
     networks: Annotated[
@@ -41,6 +49,10 @@ def network(
     periods: Annotated[
         str | None, typer.Option(help="Seconds between messages of an agent, 0.01,0.02; by default each network's own.")
     ] = None,
+    observe: Annotated[
+        MotionOption,
+        typer.Option(help="What the law acts on: estimate; or oracle: equal motion in all rows."),
+    ] = MotionOption.ESTIMATE,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each row, the same for all.")] = 16,
     duration: Annotated[float | None, typer.Option(help="Seconds of an episode; by default the scenario's.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
@@ -55,7 +67,8 @@ def network(
 ) -> None:
     """Measure what is left of estimates and their bounds when messages are sampled, lost and late.
 
-    The scenario's own law acts on the estimates. The rows are compared with continuous exchange, the paper's.
+    The scenario's own law acts on the estimates, so that better ones also move the agents otherwise; --observe oracle
+    gives all rows the same motion. They are compared with continuous exchange, the paper's.
 
     Exits with 1 if an error exceeded its certified bound. After an interrupt the rows measured until then are printed.
     """
@@ -75,7 +88,7 @@ def network(
         base = Network.of(chosen[0])
         plan: list[tuple[Sequence[Any], list[float] | None]] = [([None], None), (chosen, times)]
         plan += [(some, None) for some in sweeps(base)] if figure is not None and base is not None else []
-        arguments = {"episodes": episodes, "duration": duration, "seed": seed}
+        arguments = {"observe": observe.value, "episodes": episodes, "duration": duration, "seed": seed}
         with waiting(f"designing the observers of {name}"):
             parts = _parts(scenario, plan, by, arguments)
         counts = [1, *(len(by) * len(some) * len(at or [0]) for some, at in plan[1:])]
@@ -91,12 +104,13 @@ def network(
     rest = iter(rows)
     continuous, found, *swept = [list(itertools.islice(rest, count)) for count in counts]
     if as_json:
-        result = {"rows": found, "continuous": continuous}
-        result |= {"swept": [*itertools.chain.from_iterable(swept)]} if swept else {}
-        listed = {key: [row.as_dict() for row in some] for key, some in result.items()}
-        print_json({"scenario": scenario.name, **listed})
+        listed = [[row.as_dict() for row in some] for some in (found, continuous, itertools.chain(*swept))]
+        result = {"scenario": scenario.name, "rows": listed[0], "continuous": listed[1][0] if listed[1] else None}
+        print_json(result | ({"swept": listed[2]} if swept else {}))
     elif found:
-        _print(scenario, continuous[0], found, episodes)
+        acts = "estimates" if observe == MotionOption.ESTIMATE else "true states"
+        title = f"{scenario.name} under {scenario.law.name} on {acts}, {episodes} episodes, the same for every row"
+        _print(scenario, continuous[0], found, title)
     if swept and unfinished is None:
         _draw(scenario, continuous[0], swept, base, figure)
     if unfinished is not None:
@@ -136,7 +150,7 @@ def _numbers(text: str) -> list[float]:
         raise ValueError(f"--periods must be numbers in s, separated by commas, like 0.01,0.05; got {text!r}") from None
 
 
-def _print(scenario: Scenario, continuous: NetworkRow, rows: Sequence[NetworkRow], episodes: int) -> None:
+def _print(scenario: Scenario, continuous: NetworkRow, rows: Sequence[NetworkRow], title: str) -> None:
     unit = scenario.fleet.position_unit()
     header = ("network", "by", "per s", "loss", f"error ({unit})", "largest", "bound", "over limit", "bytes")
     print_table(
@@ -152,14 +166,14 @@ def _print(scenario: Scenario, continuous: NetworkRow, rows: Sequence[NetworkRow
             )
             for row in rows
         ],
-        f"{scenario.name} under {scenario.law.name}, {episodes} episodes, the same for every row",
+        title,
         whole=("by", "per s", "loss", *header[4:8]),
     )
     print_text(
         "per s: messages of each agent; error, largest, bound: of positions that an agent estimates of others up to "
         f"{scenario.k} hops away, mean and largest error and mean certified bound, without the first quarter of each "
         "episode, in which estimates start; over limit: mean bound over that of the freshest state which could have "
-        "arrived without losses; bytes: of the largest message, as float32"
+        "arrived without losses (latency counts in whole periods); bytes: of the largest message, as float32"
     )
     print_text(
         f"continuous exchange, without messages: error {_n(continuous.mean_error)}, largest "

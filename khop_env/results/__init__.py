@@ -4,6 +4,7 @@ from khop_env.results.assumptions import Assumption, assumptions
 from khop_env.results.curves import error_over_time, learning_curves, network_figure, set_iss_figure
 from khop_env.results.figures import paper_figure
 from khop_env.results.metrics import consensus_error, summarize
+from khop_env.results.network_report import network_report
 from khop_env.results.networks import NetworkRow, measure_networks
 from khop_env.results.recording import Recording, record
 from khop_env.results.records import MessageRecord, ObserverRecord
@@ -26,6 +27,7 @@ __all__ = [
     "learning_curves",
     "measure_networks",
     "network_figure",
+    "network_report",
     "paper_figure",
     "record",
     "set_iss_figure",

@@ -72,7 +72,7 @@ def summarize(
         scenario: scenario of the run.
         seed: seed of the initial state and the disturbance.
         dt: step in s.
-        observers: realisation of the observers.
+        observers: those of the simulator.
         controller: name of the feedback law.
         observe: information of the law on k-hop targets: estimates, true states, or none.
     """
@@ -125,7 +125,7 @@ def _of_network(observers: Observers, fleet: Fleet, states: MessageRecord) -> di
         "violations": violations(np.abs(states.error).T, states.bound.T, states.truth.T, states.layout),
         "pair_samples": states.layout.pairs * len(states.time),
         "mean_age": finite(arrived.mean()) if arrived.size else None,
-        "uncertified": {fleet.ids[agent]: reason for agent, reason in observers.boxes.uncertified.items()},
+        "uncertified": {fleet.ids[agent]: reason for agent, reason in observers.uncertified.items()},
     }
 
 
