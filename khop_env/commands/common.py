@@ -14,6 +14,7 @@ import typer
 from khop_env.terminal import say
 
 if TYPE_CHECKING:
+    from khop_env.observers import Networked
     from khop_env.scenarios import Scenario
     from khop_env.tasks import Task
 
@@ -61,6 +62,21 @@ EnvOption = Annotated[
         "repeatable.",
     ),
 ]
+NetworkOption = Annotated[
+    str | None,
+    typer.Option(
+        "--network",
+        help="Messages instead of continuous exchange: ideal, factory, wifi, espnow, ... (khop network), also with "
+        "other values, lossy:loss=0.3,burst=5; by default the scenario's own, if any.",
+    ),
+]
+EstimatorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        help="Estimates from messages: ppso (the paper's observers, by rounds) or relay (stamped states, passed on).",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
@@ -106,6 +122,38 @@ def load(name: str) -> Scenario:
         key = "law" if error.parameter is None else f"law.{error.parameter}"
         raise ValueError(f"{name}: {key}: {error}") from error
     return found
+
+
+def networked(scenario: Scenario, network: str | None, estimator: str | None) -> Networked | None:
+    """The observers over the network that the options, or else the scenario, choose; None for continuous exchange.
+
+    Raises:
+        ValueError: for an unknown network or estimator, or an estimator without a network.
+    """
+    from khop_env.observers import Networked
+
+    chosen = scenario.network if network is None else network
+    if chosen is None:
+        if estimator is not None:
+            raise ValueError(
+                f"--estimator {estimator}: estimates are made from messages, and {scenario.name} has no network; give "
+                "--network, too, e.g. --network wifi"
+            )
+        return None
+    return Networked(chosen, scenario.estimator if estimator is None else estimator)
+
+
+def with_network(arguments: dict[str, Any], network: str | None, estimator: str | None) -> dict[str, Any]:
+    """The arguments of an environment, with a network and an estimator where options choose them.
+
+    Raises:
+        ValueError: where --env chooses them, too.
+    """
+    options = {"network": network, "estimator": estimator}
+    for name, value in options.items():
+        if value is not None and name in arguments:
+            raise ValueError(f"--env {name} and --{name}: choose one of them")
+    return arguments | {name: value for name, value in options.items() if value is not None}
 
 
 def find_environment(name: str) -> Task | type[Task] | None:

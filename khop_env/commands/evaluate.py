@@ -12,11 +12,14 @@ from khop_env.commands.common import (
     EnvironmentArgument,
     EnvironmentScenario,
     EnvOption,
+    EstimatorOption,
     JsonOption,
+    NetworkOption,
     load,
     mistakes,
     print_json,
     require_figure,
+    with_network,
 )
 from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
 
@@ -38,6 +41,8 @@ def evaluate(
     observe: Annotated[
         str, typer.Option(help="Observation modes: estimate, oracle (true states), local (neighbours only).")
     ] = "estimate,oracle,local",
+    network: NetworkOption = None,
+    estimator: EstimatorOption = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each row, the same for all.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
     env: EnvOption = None,
@@ -63,6 +68,8 @@ def evaluate(
             raise ValueError("--csv and --json: choose one of them")
         require_figure(figure)
         arguments = environment_arguments(env, find_task(environment), {"observe": "--observe"})
+        arguments = with_network(arguments, network, estimator)
+        over = ", ".join(str(arguments[name]) for name in ("network", "estimator") if name in arguments)
         chosen = None if scenario is None else load(scenario)
         with Progress(f"playing {environment}") as progress:
             try:
@@ -82,7 +89,7 @@ def evaluate(
             except UnfinishedError as error:
                 comparison, unfinished = error.partial, (str(error), 2)
     if comparison.rows:
-        _print(comparison, csv, as_json)
+        _print(comparison, csv, as_json, f" over {over}" if over else "")
         if figure is not None:
             _draw(comparison, figure)
     if unfinished is not None:
@@ -91,13 +98,13 @@ def evaluate(
         raise typer.Exit(status)
 
 
-def _print(comparison: Comparison, csv: bool, as_json: bool) -> None:
+def _print(comparison: Comparison, csv: bool, as_json: bool, over: str) -> None:
     if as_json:
         print_json(comparison.summary())
     elif csv:
         typer.echo(comparison.frame().write_csv(), nl=False)
     else:
-        print_comparison(comparison)
+        print_comparison(comparison, over)
 
 
 def _draw(comparison: Comparison, figure: Path) -> None:
@@ -113,8 +120,8 @@ def _draw(comparison: Comparison, figure: Path) -> None:
     say(f"figure: {figure}")
 
 
-def print_comparison(comparison: Comparison) -> None:
-    """The table."""
+def print_comparison(comparison: Comparison, over: str) -> None:
+    """The table; `over` says which network it is about."""
     rows = []
     for number, row in enumerate(comparison.rows):
         seen = row.summary()
@@ -136,7 +143,8 @@ def print_comparison(comparison: Comparison) -> None:
         )
     unit = comparison.rows[0].env.error_unit
     header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", "|e|", "e / bound")
-    title = f"{comparison.environment} on {comparison.scenario}, {comparison.planned} episodes, the same for every row"
+    where = f"{comparison.environment} on {comparison.scenario}{over}"
+    title = f"{where}, {comparison.planned} episodes, the same for every row"
     print_table(header, rows, title)
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
