@@ -23,6 +23,7 @@ import numpy as np
 from agents import make_law
 from benchmarks.comparison import left_out
 from benchmarks.environments import environment_rows
+from benchmarks.networks import network_rows, violation_rows
 from benchmarks.report import Report, reason
 from benchmarks.training import training_rows
 from benchmarks.yardsticks import CompiledPaper, bare_loop
@@ -89,6 +90,8 @@ def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path
         ),
         Part("growth with the number of agents", partial(_growth, report.add, quick, say)),
         Part("environments", partial(environment_rows, report, quick, say, peers)),
+        Part("environments over a network, against continuous exchange", partial(network_rows, report, quick)),
+        Part("errors against certified bounds", partial(violation_rows, report, quick)),
         Part(
             "training: PPO, 64 environments of 8 agents",
             partial(training_rows, report, quick, peers),

@@ -39,12 +39,14 @@ def single(scenario: str, order: int) -> tuple[KHopEnv, Callable[[int], None]]:
 def single_rate(seconds: float, scenario: str, order: int) -> float:
     """Agent-steps per second of one `consensus_v0.parallel_env`, resets, observations and dictionaries included."""
     env, step = single(scenario, order)
-    return len(env.possible_agents) * _calls_per_second(step, seconds)
+    return len(env.possible_agents) * calls_per_second(step, seconds)
 
 
-def batched(scenario: str, order: int, threads: int, batch: int = BATCH) -> tuple[BatchedEnv, Callable[[int], None]]:
+def batched(
+    scenario: str, order: int, threads: int, batch: int = BATCH, **arguments: Any
+) -> tuple[BatchedEnv, Callable[[int], None]]:
     """A batched environment and a step with random actions that resets finished environments."""
-    env = consensus_v0.batched_env(scenario, num_envs=batch, order=order, threads=threads)
+    env = consensus_v0.batched_env(scenario, num_envs=batch, order=order, threads=threads, **arguments)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     shape = batch, len(env.agents), 2
@@ -61,7 +63,7 @@ def batched(scenario: str, order: int, threads: int, batch: int = BATCH) -> tupl
 def vector_rate(seconds: float, scenario: str, order: int, threads: int, batch: int = BATCH) -> float:
     """Agent-steps per second of a batch of `consensus_v0`, resets and observations included."""
     env, step = batched(scenario, order, threads, batch)
-    return batch * len(env.agents) * _calls_per_second(step, seconds)
+    return batch * len(env.agents) * calls_per_second(step, seconds)
 
 
 def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str, float]:
@@ -156,7 +158,8 @@ def _timed(function: Callable[..., Any], name: str, spent: dict[str, float]) -> 
     return call
 
 
-def _calls_per_second(step: Callable[[int], None], seconds: float) -> float:
+def calls_per_second(step: Callable[[int], None], seconds: float) -> float:
+    """Calls of `step`, with their number, within about `seconds`; the first three aren't counted."""
     for number in range(3):
         step(number)
     number, start = 0, time.perf_counter()

@@ -20,6 +20,7 @@ from khop_env import __version__
 from khop_env.commands.bench import bench
 from khop_env.commands.evaluate import evaluate
 from khop_env.commands.iss import iss
+from khop_env.commands.network import network
 from khop_env.commands.run import run
 from khop_env.commands.scenarios import check, export, list_scenarios
 from khop_env.commands.test import contract
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "tune": tune,
     "iss": iss,
+    "network": network,
     "test": contract,
     "bench": bench,
 }

@@ -1,4 +1,4 @@
-"""Load Python objects by name, for the command line: `my_module:make_env`."""
+"""Names on the command line: lists of them, and Python objects by name, `my_module:make_env`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,39 @@ from khop_env.own_agents import AGENTS
 Result = TypeVar("Result")
 
 _LISTED = 8  # names of a module in an error message
+
+
+def split_specs(text: str, option: str, kind: str) -> list[str]:
+    """A list of names with parameters, split at commas; a part "key=value" belongs to the name before it.
+
+        split_specs("ideal,wifi,lossy:loss=0.3,burst=5", "--networks", "network")
+        # ["ideal", "wifi", "lossy:loss=0.3,burst=5"]
+
+    Args:
+        text: as it was written.
+        option: where it was, for errors.
+        kind: of which kind they are, for errors.
+
+    Raises:
+        ValueError: for no name at all, an empty part, a key=value without a name before it, or a name twice.
+    """
+    if not text.strip(" ,"):
+        raise ValueError(f"{option}: name at least one {kind}; got {text!r}")
+    found: list[str] = []
+    for part in text.split(","):
+        name, equals, _ = part.partition("=")
+        if not part.strip():
+            raise ValueError(f"{option} {text!r}: there is nothing between two commas or at an end")
+        if not equals or ":" in name:
+            found.append(part.strip())
+        elif not found:
+            raise ValueError(f"{option} {text!r}: no {kind} before {part.strip()!r}; write NAME:{part.strip()}")
+        else:
+            found[-1] += f"{',' if ':' in found[-1] else ':'}{part.strip()}"
+    for spec in found:
+        if found.count(spec) > 1:
+            raise ValueError(f"{option} names {spec!r} twice")
+    return found
 
 
 def load_object(name: str) -> Any:

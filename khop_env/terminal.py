@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import sys
 import textwrap
 import time
@@ -15,6 +17,7 @@ import typer
 SHOWN_TARGETS = 20
 _SHOWN_IDS = 6  # of a k-hop set
 _PAGE = 80  # columns
+_LONGEST_NAME = 18  # characters in a table; longer ones are folded
 
 _UNSURE = 0.5  # s of work before it is guessed how long it will take
 _LONG = 2.0  # s: work that takes longer gets a progress bar
@@ -119,6 +122,16 @@ def print_table(
     Console(width=total, markup=False, highlight=False).print(table)
 
 
+def folded(name: str) -> str:
+    """A long name in several lines, which end at its own separators."""
+    lines = [""]
+    for piece in re.split(r"(?<=[/:,@-])", name):
+        if lines[-1] and len(lines[-1]) + len(piece) > _LONGEST_NAME:
+            lines.append("")
+        lines[-1] += piece
+    return "\n".join(lines)
+
+
 def _narrowed(lengths: Sequence[Sequence[int]], least: Sequence[int], room: int) -> list[int]:
     """Widths of columns that fit into `room` as far as their least widths let them.
 
@@ -149,11 +162,40 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
     observed = {"estimate": "estimates", "oracle": "true states (oracle)", "local": "neighbours only"}[
         summary["observe"]
     ]
+    networked = "network" in summary
+    how = summary["estimator"] if networked else f"{summary['integrator']}, order {summary['order']}"
     print_text(
         f"{summary['scenario']}: {summary['agents']} agents, {summary['pairs']} pairs of observer and target, "
-        f"{summary['duration']:.6g} s in steps of {summary['dt']:g} s ({summary['integrator']}, order "
-        f"{summary['order']}), {summary['controller']} on {observed}, seed {summary['seed']}"
+        f"{summary['duration']:.6g} s in steps of {summary['dt']:g} s ({how}), {summary['controller']} on {observed}, "
+        f"seed {summary['seed']}"
     )
+    if networked:
+        _print_certified(summary)
+    else:
+        _print_guarantee(summary)
+    _print_end(summary, files)
+
+
+def _print_certified(summary: Mapping[str, Any]) -> None:
+    """What became of the certified bounds."""
+    age = summary["mean_age"]
+    known = "nothing arrived" if age is None else f"states that agents know are {1e3 * age:.4g} ms old on average"
+    print_text(f"network: {summary['network']}; {known}")
+    ratio = f"largest |error| / certified bound {_ratio(summary['max_error_to_bound'])}"
+    if summary["max_normalized_disagreement"] is not None:
+        ratio += f"; |xi|/rho of what agents hold {_ratio(summary['max_normalized_disagreement'])}"
+    kept = "kept" if summary["funnel_kept"] else "not kept"
+    violated = f"{summary['violations']} violations in {summary['pair_samples']} pairs and samples"
+    print_text(f"certified bounds {kept}: {ratio}; {violated}")
+    for agent, reason in itertools.islice(summary["uncertified"].items(), _SHOWN_IDS):
+        print_text(f"{agent}: {reason}")
+    if summary["error"] is not None or summary.get("terminated"):
+        how = "the episode stopped early" if summary["error"] is not None else "the task ended the episode"
+        print_text(f"{how}, at t = {summary['duration']:.6g} s")
+
+
+def _print_guarantee(summary: Mapping[str, Any]) -> None:
+    """What became of the funnels."""
     ratios = f"|xi|/rho {_ratio(summary['max_normalized_disagreement'])}, "
     ratios += f"|x_tilde|/bound {_ratio(summary['max_error_to_bound'])}"
     if summary["max_error_to_bound_input"] is not None:
@@ -168,6 +210,9 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
         print_text(f"guarantee not kept: stopped at t = {summary['duration']:.6g} s; until then largest {ratios}")
     else:
         print_text(f"guarantee not kept: largest {ratios} (should be below 1)")
+
+
+def _print_end(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None:
     if "environment" in summary:
         error = _number(summary["final_task_error"], summary["task_error_unit"])
         print_text(
@@ -249,6 +294,27 @@ def print_design(report: Mapping[str, Any]) -> None:
         print_text(f"feasible: every condition of the observers that can be checked before the start holds{later}")
     else:
         print_text(f"not feasible: {report['error']}")
+
+
+def print_network(report: Mapping[str, Any]) -> None:
+    """What is certain over a network."""
+    print_text(f"network: {report['network']}; estimator {report['estimator']}")
+    for each in report["types"]:
+        print_text(f"{each['type']}: {each['reason'] or 'certified'}")
+    print_table(
+        ("estimated", "links away", "expected age", "certified bound", "ideal bound"),
+        [
+            (
+                f"{each['component']} of {each['type']}",
+                str(each["hops"]),
+                "never arrives" if each["expected_age"] is None else f"{1e3 * each['expected_age']:.4g} ms",
+                "none" if each["certified"] is None else f"{each['certified']:.3g} {each['unit']}",
+                "known exactly" if each["hops"] == 1 else _number(each["ideal"], each["unit"]),
+            )
+            for each in report["bounds"]
+        ],
+        "Certified bounds at the mean age of states that come by one path; ideal ones after the transient",
+    )
 
 
 def _spectrum_row(target: Mapping[str, Any]) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ import pytest
 from typer.testing import CliRunner
 
 from khop_env.cli import app
-from khop_env.commands.evaluate import split_policies
 
 
 def khop(*arguments: str, status: int = 0):
@@ -71,14 +70,6 @@ def test_evaluate_prints_csv():
 )
 def test_evaluate_refuses(arguments, said):
     assert said in khop("evaluate", *arguments, status=2).stderr
-
-
-def test_policies_and_their_parameters_are_told_apart():
-    assert split_policies("tanh, linear:gain=2,cancel_drift=true ,zero") == [
-        "tanh",
-        "linear:gain=2,cancel_drift=true",
-        "zero",
-    ]
 
 
 def test_iss(tmp_path):

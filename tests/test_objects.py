@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from khop_env.objects import described, load_object
+from khop_env.objects import described, load_object, split_specs
 
 
 @pytest.fixture
@@ -104,3 +104,35 @@ def test_where_an_exception_was_raised():
         "test_where_an_exception_was_raised)"
     )
     assert described(ValueError("never raised")) == "ValueError: never raised"
+
+
+class TestLists:
+    def test_they_are_split_at_names(self):
+        def split(text):
+            return split_specs(text, "--networks", "network")
+
+        assert split("ideal,wifi,lossy:loss=0.3,burst=5") == ["ideal", "wifi", "lossy:loss=0.3,burst=5"]
+        assert split("ideal, period=0.1,wifi") == ["ideal:period=0.1", "wifi"]
+        assert split("lossy:loss=0.3,lossy:loss=0.4,burst=2,espnow") == [
+            "lossy:loss=0.3",
+            "lossy:loss=0.4,burst=2",
+            "espnow",
+        ]
+        assert split("tanh, linear:gain=2,cancel_drift=true ,my_file.py:Mine") == [
+            "tanh",
+            "linear:gain=2,cancel_drift=true",
+            "my_file.py:Mine",
+        ]
+
+    @pytest.mark.parametrize(
+        ("text", "problem"),
+        [
+            ("", "--networks: name at least one network; got ''"),
+            ("ideal,,wifi", "there is nothing between two commas or at an end"),
+            ("loss=1", "no network before 'loss=1'; write NAME:loss=1"),
+            ("wifi,ideal,wifi", "--networks names 'wifi' twice"),
+        ],
+    )
+    def test_mistakes_name_the_option(self, text, problem):
+        with pytest.raises(ValueError, match=problem):
+            split_specs(text, "--networks", "network")

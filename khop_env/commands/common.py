@@ -6,6 +6,7 @@ import enum
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,6 +14,7 @@ import typer
 from khop_env.terminal import say
 
 if TYPE_CHECKING:
+    from khop_env.observers import Networked
     from khop_env.scenarios import Scenario
     from khop_env.tasks import Task
 
@@ -58,6 +60,21 @@ EnvOption = Annotated[
         metavar="NAME=VALUE",
         help="An argument of the environment: control_period=0.1, reward=team, leaders=drifter_0+drifter_3; "
         "repeatable.",
+    ),
+]
+NetworkOption = Annotated[
+    str | None,
+    typer.Option(
+        "--network",
+        help="Messages instead of continuous exchange: ideal, factory, wifi, espnow, ... (khop network), also with "
+        "other values, lossy:loss=0.3,burst=5; by default the scenario's own, if any.",
+    ),
+]
+EstimatorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        help="Estimates from messages: ppso (the paper's observers, by rounds) or relay (stamped states, passed on).",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -107,6 +124,38 @@ def load(name: str) -> Scenario:
     return found
 
 
+def networked(scenario: Scenario, network: str | None, estimator: str | None) -> Networked | None:
+    """The observers over the network that the options, or else the scenario, choose; None for continuous exchange.
+
+    Raises:
+        ValueError: for an unknown network or estimator, or an estimator without a network.
+    """
+    from khop_env.observers import Networked
+
+    chosen = scenario.network if network is None else network
+    if chosen is None:
+        if estimator is not None:
+            raise ValueError(
+                f"--estimator {estimator}: estimates are made from messages, and {scenario.name} has no network; give "
+                "--network, too, e.g. --network wifi"
+            )
+        return None
+    return Networked(chosen, scenario.estimator if estimator is None else estimator)
+
+
+def with_network(arguments: dict[str, Any], network: str | None, estimator: str | None) -> dict[str, Any]:
+    """The arguments of an environment, with a network and an estimator where options choose them.
+
+    Raises:
+        ValueError: where --env chooses them, too.
+    """
+    options = {"network": network, "estimator": estimator}
+    for name, value in options.items():
+        if value is not None and name in arguments:
+            raise ValueError(f"--env {name} and --{name}: choose one of them")
+    return arguments | {name: value for name, value in options.items() if value is not None}
+
+
 def find_environment(name: str) -> Task | type[Task] | None:
     """The task that a name of an environment, or of a Python object, stands for; None where it is no such name.
 
@@ -125,6 +174,20 @@ def find_environment(name: str) -> Task | type[Task] | None:
     return (
         find_task(found) if isinstance(found, Task) or (isinstance(found, type) and issubclass(found, Task)) else None
     )
+
+
+def require_figure(figure: Path | None) -> None:
+    """Refuse a figure that couldn't be written before there is something to lose, and make its folder.
+
+    Raises:
+        ValueError: for a file name of another kind.
+        OSError: if its folder can't be made.
+    """
+    if figure is None:
+        return
+    if figure.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"--figure {figure}: a figure's name ends in .png, .pdf or .svg")
+    figure.parent.mkdir(parents=True, exist_ok=True)
 
 
 def print_json(value: Any) -> None:

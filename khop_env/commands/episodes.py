@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from khop_env.commands.common import find_environment, load
+from khop_env.commands.common import find_environment, load, with_network
 from khop_env.commands.folders import digest, sources
 from khop_env.terminal import say
 
 if TYPE_CHECKING:
     from agents.running import PolicyRun
-    from khop_env.observers import Observers
+    from khop_env.observers import Networked, Observers
     from khop_env.results import Recording
     from khop_env.scenarios import LawChoice, Scenario
     from khop_env.tasks import Task
@@ -105,13 +105,17 @@ def continuous(
     duration: float | None,
     steps: Mapping[str, Any],
     seed: int,
+    over: Networked | None,
 ) -> Episode:
-    """The closed loop under a law that is evaluated at every instant."""
+    """The closed loop under a law that is evaluated at every instant, or over a network at every step."""
     from agents.laws import make_law
     from khop_env.observers import Explicit, Proximal
     from khop_env.scenarios.scenario import number_of_steps
     from khop_env.simulation.plant import parts_of_step
 
+    for option in ("--order", "--integrator"):
+        if over is not None and steps[option] is not None:
+            raise ValueError(f"{option}: over a network estimates follow from rounds of messages; leave it out")
     order, explicit = steps["--order"], steps["--integrator"] is not None
     if explicit and order is OrderOption.TWO:
         raise ValueError("--order 2: the explicit integrator is forward Euler, of order 1; leave --order out")
@@ -121,13 +125,14 @@ def continuous(
     law = _law(scenario, controller)
     made = make_law(law)
     longest, stiffest = scenario.longest_step
-    parts_of_step(dt, longest, scenario.fleet.ids[stiffest])
-    observers = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
+    parts_of_step(dt, longest, f"the drift of {scenario.fleet.ids[stiffest]!r}")
+    own = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
+    observers: Observers = own if over is None else over
     simulator = scenario.build(law=made, observe=observe, observers=observers)
     simulator.reset(seed)
     for warning in scenario.warnings:
         say(f"khop: {warning}")
-    return Episode(simulator, None, observers, law.name, duration, dt, digest(law.name, law.parameters))
+    return Episode(simulator, None, simulator.observers, law.name, duration, dt, digest(law.name, law.parameters))
 
 
 def played_episode(
@@ -139,6 +144,8 @@ def played_episode(
     duration: float | None,
     seed: int,
     env: list[str] | None,
+    network: str | None,
+    estimator: str | None,
 ) -> Episode:
     """A policy in an environment."""
     from agents.running import environment_for, policy_run
@@ -151,7 +158,7 @@ def played_episode(
     elsewhere = {"observe": "--observe"} | ({} if duration is None else {"max_cycles": "--duration"})
     spec = controller or scenario.law.name
     acted = task if task is not None else find_task(environment_for(spec, scenario))
-    arguments = environment_arguments(env, acted, elsewhere)
+    arguments = with_network(environment_arguments(env, acted, elsewhere), network, estimator)
     if task is None and duration is None and "max_cycles" not in arguments:
         duration = scenario.duration
     played = policy_run(spec, scenario, observe, duration, seed, environment=acted, arguments=arguments)
@@ -167,6 +174,7 @@ def played_episode(
 def configuration_of(scenario: Scenario, episode: Episode, observe: str, seed: int) -> dict[str, Any]:
     """What the numbers of a run depend on, as JSON has it."""
     from agents.learning.fingerprint import plain
+    from khop_env.observers import Networked
 
     found = {
         "scenario": scenario.name,
@@ -180,6 +188,8 @@ def configuration_of(scenario: Scenario, episode: Episode, observe: str, seed: i
         "scenario_content": digest(scenario, sources(scenario.models)),
         "controller_content": episode.content,
     }
+    if isinstance(episode.observers, Networked):
+        found |= {"network": plain(episode.observers.network), "estimator": episode.observers.estimator.name}
     if episode.played is not None:
         batched = episode.played.env.batched
         found |= {"environment": batched.task.environment, "settings": plain(batched.settings)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,17 +12,19 @@ from khop_env.commands.common import (
     EnvironmentArgument,
     EnvironmentScenario,
     EnvOption,
+    EstimatorOption,
     JsonOption,
+    NetworkOption,
     load,
     mistakes,
     print_json,
+    require_figure,
+    with_network,
 )
-from khop_env.terminal import Progress, print_table, print_text, say, waiting
+from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
 
 if TYPE_CHECKING:
     from agents.comparison import Comparison
-
-_LONGEST_NAME = 18  # characters of a policy in the table; longer names are folded
 
 
 def evaluate(
@@ -40,6 +41,8 @@ def evaluate(
     observe: Annotated[
         str, typer.Option(help="Observation modes: estimate, oracle (true states), local (neighbours only).")
     ] = "estimate,oracle,local",
+    network: NetworkOption = None,
+    estimator: EstimatorOption = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each row, the same for all.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
     env: EnvOption = None,
@@ -55,6 +58,7 @@ def evaluate(
     """
     from agents.comparison import compare
     from agents.workers import Interrupted, UnfinishedError
+    from khop_env.objects import split_specs
     from khop_env.registry import find_task
     from khop_env.typed import environment_arguments
 
@@ -62,17 +66,16 @@ def evaluate(
     with mistakes():
         if csv and as_json:
             raise ValueError("--csv and --json: choose one of them")
-        if figure is not None:
-            if figure.suffix.lower() not in (".png", ".pdf", ".svg"):
-                raise ValueError(f"--figure {figure}: a figure's name ends in .png, .pdf or .svg")
-            figure.parent.mkdir(parents=True, exist_ok=True)  # before anything is played that could be lost
+        require_figure(figure)
         arguments = environment_arguments(env, find_task(environment), {"observe": "--observe"})
+        arguments = with_network(arguments, network, estimator)
+        over = ", ".join(str(arguments[name]) for name in ("network", "estimator") if name in arguments)
         chosen = None if scenario is None else load(scenario)
         with Progress(f"playing {environment}") as progress:
             try:
                 comparison = compare(
                     environment,
-                    split_policies(policies),
+                    split_specs(policies, "--policies", "policy"),
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
                     scenario=chosen,
                     arguments=arguments,
@@ -86,7 +89,7 @@ def evaluate(
             except UnfinishedError as error:
                 comparison, unfinished = error.partial, (str(error), 2)
     if comparison.rows:
-        _print(comparison, csv, as_json)
+        _print(comparison, csv, as_json, f" over {over}" if over else "")
         if figure is not None:
             _draw(comparison, figure)
     if unfinished is not None:
@@ -95,13 +98,13 @@ def evaluate(
         raise typer.Exit(status)
 
 
-def _print(comparison: Comparison, csv: bool, as_json: bool) -> None:
+def _print(comparison: Comparison, csv: bool, as_json: bool, over: str) -> None:
     if as_json:
         print_json(comparison.summary())
     elif csv:
         typer.echo(comparison.frame().write_csv(), nl=False)
     else:
-        print_comparison(comparison)
+        print_comparison(comparison, over)
 
 
 def _draw(comparison: Comparison, figure: Path) -> None:
@@ -117,28 +120,8 @@ def _draw(comparison: Comparison, figure: Path) -> None:
     say(f"figure: {figure}")
 
 
-def split_policies(text: str) -> list[str]:
-    """Policies from "tanh,linear:gain=2,cancel_drift=true": a further parameter belongs to the policy before it.
-
-    Raises:
-        ValueError: for no policy, or one named twice.
-    """
-    found: list[str] = []
-    for piece in filter(None, (part.strip() for part in text.split(","))):
-        if "=" in piece and ":" not in piece and found:
-            found[-1] += f",{piece}"
-        else:
-            found.append(piece)
-    if not found:
-        raise ValueError("name at least one policy, e.g. --policies tanh,zero")
-    for spec in found:
-        if found.count(spec) > 1:
-            raise ValueError(f"--policies names {spec!r} twice")
-    return found
-
-
-def print_comparison(comparison: Comparison) -> None:
-    """The table."""
+def print_comparison(comparison: Comparison, over: str) -> None:
+    """The table; `over` says which network it is about."""
     rows = []
     for number, row in enumerate(comparison.rows):
         seen = row.summary()
@@ -148,7 +131,7 @@ def print_comparison(comparison: Comparison) -> None:
         few = "" if count == comparison.planned else f" ({count} episodes)"
         rows.append(
             (
-                f"{_folded(row.policy)} on {row.observe}{few}",
+                f"{folded(row.policy)} on {row.observe}{few}",
                 _with_interval(seen["mean_return"], seen["ci95"]),
                 _with_interval(more, interval, sign="+") if number else "",
                 f"{seen['final_task_error']:.3g}",
@@ -160,7 +143,8 @@ def print_comparison(comparison: Comparison) -> None:
         )
     unit = comparison.rows[0].env.error_unit
     header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", "|e|", "e / bound")
-    title = f"{comparison.environment} on {comparison.scenario}, {comparison.planned} episodes, the same for every row"
+    where = f"{comparison.environment} on {comparison.scenario}{over}"
+    title = f"{where}, {comparison.planned} episodes, the same for every row"
     print_table(header, rows, title)
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
@@ -168,16 +152,6 @@ def print_comparison(comparison: Comparison) -> None:
         "below a tenth of the initial one; effort: mean |u|^2, u in fractions of the limits; |e|: largest |xi| / rho; "
         "e / bound: largest estimation error over its bound (of all observers, below 1 by guarantee)"
     )
-
-
-def _folded(policy: str) -> str:
-    """A long name in several lines, which end at its own separators."""
-    lines = [""]
-    for piece in re.split(r"(?<=[/:,@-])", policy):
-        if lines[-1] and len(lines[-1]) + len(piece) > _LONGEST_NAME:
-            lines.append("")
-        lines[-1] += piece
-    return "\n".join(lines)
 
 
 def _with_interval(value: float, interval: float | None, sign: str = "") -> str:

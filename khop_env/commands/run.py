@@ -9,9 +9,12 @@ import typer
 
 from khop_env.commands.common import (
     EnvOption,
+    EstimatorOption,
     JsonOption,
+    NetworkOption,
     ObserveOption,
     mistakes,
+    networked,
     print_json,
 )
 from khop_env.commands.episodes import (
@@ -30,6 +33,7 @@ from khop_env.terminal import Progress, say, waiting
 
 if TYPE_CHECKING:
     from agents.running import PolicyRun
+    from khop_env.observers import Observers
     from khop_env.results import Recording
     from khop_env.scenarios import Scenario
 
@@ -72,6 +76,8 @@ def run(
     order: Annotated[
         OrderOption | None, typer.Option(help="Order of the proximal integrator; by default the scenario's.")
     ] = None,
+    network: NetworkOption = None,
+    estimator: EstimatorOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the initial state and the disturbance.")] = 0,
     env: EnvOption = None,
     out: Annotated[
@@ -93,8 +99,10 @@ def run(
     A scenario is simulated in continuous time, under a law. An environment plays its task: its controller, law or
     policy, acts once per control period; so do policies on a scenario.
 
-    Exits with 1 if a funnel was left. All results up to then are written. A folder with another run in it is left
-    alone.
+    With --network agents know of each other by messages; estimates then have certified bounds.
+
+    Exits with 1 if a funnel, or a certified bound, was left. All results up to then are written. A folder with another
+    run in it is left alone.
     """
     from khop_env.results import RunFileError, record, summarize, write_run
 
@@ -108,17 +116,21 @@ def run(
                         f"{option}: a policy acts in its environment, which chooses its own steps: --env dt=0.01, "
                         "--env order=2"
                     )
-            episode = played_episode(name, task, chosen, controller, observe.value, duration, seed, env)
+            episode = played_episode(
+                name, task, chosen, controller, observe.value, duration, seed, env, network, estimator
+            )
         else:
             if env:
                 raise ValueError(f"--env is for environments; {name} is a scenario, simulated under a law")
-            episode = continuous(chosen, controller, observe.value, duration, steps, seed)
+            over = networked(chosen, network, estimator)
+            episode = continuous(chosen, controller, observe.value, duration, steps, seed, over)
         played = episode.played
         configuration = configuration_of(chosen, episode, observe.value, seed)
-        film = _film(video, observer, chosen)
+        film = _film(video, observer, chosen, episode.observers)
         parts = [chosen.name, episode.controller, observe.value, "explicit" * (episode.observers.name == "explicit")]
         if played is not None:
             parts.insert(0, played.env.batched.task.environment)
+        parts += [network or "", estimator or ""]
         folder = choose_folder(Path("runs") / folder_name(*parts, f"seed{seed}"), out, configuration)
     with Progress(f"simulating {chosen.name}") as progress:
         recording = record(
@@ -163,7 +175,7 @@ def run(
         raise typer.Exit(1)
 
 
-def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int | None:
+def _film(video: Path | None, observer: str | None, scenario: Scenario, observers: Observers) -> int | None:
     """Refuse a film that couldn't be made before there is something to lose; the number of the agent to show, if any.
 
     Raises:
@@ -178,6 +190,8 @@ def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int |
     from khop_env.results.video import require_video
 
     require_video(video)
+    if observers.by_messages:
+        raise ValueError("--video: frames show continuous exchange; a run over a network can't be filmed")
     shown = None if observer is None else scenario.fleet.agent(int(observer) if observer.isdecimal() else observer)
     video.parent.mkdir(parents=True, exist_ok=True)
     return shown

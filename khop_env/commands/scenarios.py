@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import typer
 
-from khop_env.commands.common import JsonOption, ScenarioArgument, in_words_of_the_file, load, mistakes, print_json
+from khop_env.commands.common import (
+    EstimatorOption,
+    JsonOption,
+    NetworkOption,
+    ScenarioArgument,
+    in_words_of_the_file,
+    load,
+    mistakes,
+    networked,
+    print_json,
+)
 from khop_env.terminal import print_table, print_text, waiting
 
 
@@ -30,23 +40,38 @@ def list_scenarios(as_json: JsonOption = False) -> None:
     print_text(f"environments: {', '.join(environments())}")
 
 
-def check(name: ScenarioArgument, as_json: JsonOption = False) -> None:
+def check(
+    name: ScenarioArgument,
+    network: NetworkOption = None,
+    estimator: EstimatorOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Report the design of a scenario's observers: k-hop sets, funnels, feasibility, the paper's assumptions.
+
+    With --network, or a scenario that has one, also what is certain over it: bounds by distance, beside the ideal ones.
 
     Exits with 1 if a condition of the observers doesn't hold.
     """
-    from khop_env.results import design_report
+    from khop_env.results import design_report, network_report
 
     with mistakes(name), waiting(f"designing the observers of {name}"):
-        report = design_report(load(name))
+        scenario = load(name)
+        over = networked(scenario, network, estimator)
+        report = design_report(scenario)
+        if over is not None:
+            known = None if report["pairs"] is None else network_report(scenario, over.network)
+            report["network"] = known and known | {"estimator": over.estimator.name}
     if report["error"] is not None:
         report["error"] = in_words_of_the_file(name, report["error"])
     if as_json:
         print_json(report)
     else:
-        from khop_env.terminal import print_design
+        from khop_env.terminal import print_design, print_network
 
         print_design(report)
+        if over is not None and report["network"] is not None:
+            typer.echo()
+            print_network(report["network"])
     if not report["feasible"]:
         raise typer.Exit(1)
 

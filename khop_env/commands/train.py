@@ -15,11 +15,14 @@ import typer
 from khop_env.commands.common import (
     EnvironmentScenario,
     EnvOption,
+    EstimatorOption,
     JsonOption,
+    NetworkOption,
     ObserveOption,
     load,
     mistakes,
     print_json,
+    with_network,
 )
 from khop_env.commands.folders import folder_name
 from khop_env.extras import how_to_install
@@ -56,6 +59,8 @@ def train(
     bounds: Annotated[
         bool | None, typer.Option("--bounds", help="Add the guaranteed bounds of the estimates to its observations.")
     ] = None,
+    network: NetworkOption = None,
+    estimator: EstimatorOption = None,
     algo: Annotated[AlgorithmOption | None, typer.Option(help="Algorithm; by default ppo.")] = None,
     per_type: Annotated[bool | None, typer.Option("--per-type", help="One network for each type of agent.")] = None,
     timesteps: Annotated[
@@ -115,7 +120,7 @@ def train(
         from agents.policy import describe
 
         set_by_options = {name: value for name, value in options.items() if value is not None}
-        chosen = _chosen(config, settings or [], set_by_options, env or [])
+        chosen = _chosen(config, settings or [], set_by_options, env or [], (network, estimator))
         played = describe(build(chosen, 1))  # refuses what doesn't fit before there is a folder
         unit = played.error_unit
         folder = out or Path("runs") / "train" / _folder(chosen, played.environment)
@@ -152,7 +157,13 @@ def train(
         typer.echo(f"play it: {_play(chosen, folder)}")
 
 
-def _chosen(file: Path | None, settings: list[str], options: Mapping[str, Any], env: list[str]) -> TrainingConfig:
+def _chosen(
+    file: Path | None,
+    settings: list[str],
+    options: Mapping[str, Any],
+    env: list[str],
+    over: tuple[str | None, str | None],
+) -> TrainingConfig:
     """The settings: those of the options, then of --set, then of the file, then the defaults.
 
     Raises:
@@ -171,7 +182,7 @@ def _chosen(file: Path | None, settings: list[str], options: Mapping[str, Any], 
     task = find_task(found["environment"])
     elsewhere = {"observe": "--observe", "bounds": "--bounds"}
     arguments = fitting_values(found.get("arguments", {}), f"{file}: arguments", environment_types(task))
-    found["arguments"] = arguments | environment_arguments(env, task, elsewhere)
+    found["arguments"] = arguments | with_network(environment_arguments(env, task, elsewhere), *over)
     if found.get("scenario") is not None:
         load(found["scenario"])  # refuses one with a law that there isn't, as every command does
     return TrainingConfig(**({**_OF_SAC, **found} if found.get("algorithm") == "sac" else found))
@@ -189,5 +200,8 @@ def _play(config: TrainingConfig, folder: Path) -> str:
     command = ["khop", "evaluate", str(config.environment)]
     command += ["--scenario", str(config.scenario)] if config.scenario else []
     for name, value in config.as_dict()["arguments"].items():
+        if name in ("network", "estimator") and isinstance(value, str):
+            command += [f"--{name}", value]
+            continue
         command += ["--env", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
     return shlex.join([*command, "--policies", f"{config.algorithm}:{folder}"])

@@ -8,7 +8,7 @@ from khop_env.network.activity import Activity
 from khop_env.network.channel import Channel, ChannelMemory
 from khop_env.network.link import PlainLink, plain_noise
 from khop_env.network.network import PROFILES, Network
-from khop_env.network.reading import Span, split_networks
+from khop_env.network.reading import Span
 from khop_env.network.schedules import SCHEDULES, Both, Fixed, Outage, RandomLinks, Range, Schedule, Switching
 
 __all__ = [
@@ -28,5 +28,4 @@ __all__ = [
     "Span",
     "Switching",
     "plain_noise",
-    "split_networks",
 ]

@@ -9,28 +9,6 @@ import numpy as np
 Span: TypeAlias = float | tuple[float, float]
 
 
-def split_networks(text: str) -> list[str]:
-    """A list of networks as one text, split at commas; a part "key=value" belongs to the name before it.
-
-        split_networks("ideal,wifi,lossy:loss=0.3,burst=5")     # ["ideal", "wifi", "lossy:loss=0.3,burst=5"]
-
-    Raises:
-        ValueError: for an empty part, or a key=value without a name before it.
-    """
-    found: list[str] = []
-    for part in text.split(","):
-        name, equals, _ = part.partition("=")
-        if not part.strip():
-            raise ValueError(f"networks {text!r}: there is nothing between two commas or at an end")
-        if not equals or ":" in name:
-            found.append(part.strip())
-        elif not found:
-            raise ValueError(f"networks {text!r}: no name before {part!r}; write e.g. 'ideal:{part.strip()}'")
-        else:
-            found[-1] += f"{',' if ':' in found[-1] else ':'}{part.strip()}"
-    return found
-
-
 def parsed(text: str, what: str) -> Span | None:
     """A number, a range "low..high", or "none"; `what` it is, for error messages.
 

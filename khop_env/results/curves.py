@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from khop_env.observers import FloatArray
 from khop_env.results.figures import COLORS, STYLE
+
+if TYPE_CHECKING:
+    from khop_env.results.networks import NetworkRow
 
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)))
 
@@ -136,6 +139,76 @@ def set_iss_figure(
         figure.suptitle(title, fontsize=10.5, color="#333333")
         figure.savefig(path, dpi=150)
     return Path(path)
+
+
+def network_figure(
+    by_period: Sequence[NetworkRow],
+    by_loss: Sequence[NetworkRow],
+    continuous: NetworkRow,
+    path: str | Path,
+    title: str,
+    unit: str = "m",
+) -> Path:
+    """Errors and certified bounds in two panels: against the period of messages, and against their loss.
+
+    Args:
+        by_period: rows of `measure_networks` that differ in estimator and period.
+        by_loss: rows that differ in estimator and loss.
+        continuous: the row of continuous exchange.
+        path: path of the image file.
+        title: title of the figure.
+        unit: unit of positions.
+
+    Returns:
+        The path.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 4.8), layout="constrained")
+        panels = figure.subplots(1, 2, sharey=True)
+        estimators = list(dict.fromkeys(row.estimator for row in by_period))
+        colors = dict(zip(estimators, (COLORS[3], COLORS[0], *COLORS[1:3]), strict=False))
+        for axes, rows, key in zip(panels, (by_period, by_loss), ("period", "loss"), strict=True):
+            for estimator in estimators:
+                chosen = [row for row in rows if row.estimator == estimator]
+                at = [getattr(row, key) for row in chosen]
+                for quantity, style in _NETWORK_LINES.items():
+                    values = [np.nan if (y := getattr(row, quantity)) is None else y for row in chosen]
+                    axes.plot(at, np.where(np.array(values) > 0.0, values, np.nan), color=colors[estimator], **style)
+            limits = [(row.mean_bound or np.nan) / (row.bound_to_limit or np.nan) for row in rows]
+            spots = [getattr(row, key) for row in rows]
+            axes.plot(spots[:: len(estimators)], limits[:: len(estimators)], color="#BBBBBB", linewidth=4.0, zorder=1)
+            if continuous.mean_error:
+                axes.axhline(continuous.mean_error, color="#777777", linestyle=(0, (1.5, 1.5)))
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+        panels[0].set_title("(a) against the period of messages", loc="left")
+        panels[0].set_xlabel("period (s)")
+        panels[0].set_ylabel(f"error of estimated positions, and its bound ({unit})")
+        panels[1].set_title("(b) against their loss", loc="left")
+        panels[1].set_xlabel("share of lost messages")
+        panels[0].yaxis.set_tick_params(labelleft=True)
+        entries = [Line2D([], [], color=color, label=name) for name, color in colors.items()]
+        names = {"mean_bound": "mean certified bound", "max_error": "largest error", "mean_error": "mean error"}
+        entries += [Line2D([], [], color="#333333", label=name, **_NETWORK_LINES[key]) for key, name in names.items()]
+        entries += [
+            Line2D([], [], color="#BBBBBB", linewidth=4.0, label="information limit"),
+            Line2D([], [], color="#777777", linestyle=(0, (1.5, 1.5)), label="continuous exchange,\nmean error"),
+        ]
+        figure.legend(handles=entries, loc="outside right center", fontsize=8.5, handlelength=3.0)
+        figure.suptitle(title, fontsize=10.5, color="#333333")
+        figure.savefig(path, dpi=150)
+    return Path(path)
+
+
+_NETWORK_LINES: dict[str, dict[str, Any]] = {
+    "mean_bound": {"linestyle": (0, (5, 2)), "marker": "s", "markersize": 4},
+    "max_error": {"linestyle": (0, (1.5, 1.5)), "marker": "^", "markersize": 4},
+    "mean_error": {"linestyle": "-", "marker": "o", "markersize": 4},
+}
 
 
 def learning_curves(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], path: str | Path) -> Path:

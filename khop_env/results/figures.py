@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from khop_env.observers import FloatArray
-from khop_env.results.recording import ObserverRecord, Recording
+from khop_env.physics import hops_from_targets
+from khop_env.results.metrics import ROUNDING
+from khop_env.results.recording import Recording
+from khop_env.results.records import MessageRecord, ObserverRecord
 from khop_env.scenarios import Scenario
 
 if TYPE_CHECKING:
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
 # M. Okabe and K. Ito, Color Universal Design, 2008: distinguishable for colour-blind readers; without yellow (too pale)
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#8C8C8C")
 _ERROR, _DISAGREEMENT = COLORS[0], COLORS[3]
+_BY_HOPS = (COLORS[2], COLORS[0], COLORS[3], *COLORS[4:])
 _MOST_LABELS = 12  # agents with a colour each in panel (a)
 _MOST_POINTS = 500_000  # plotted in panel (a)
 
@@ -27,6 +31,10 @@ def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, age
     (a) The agents' positions, from crosses (initial) to dots (final). (b) The largest |estimation error| and
     |disagreement| over all observers of one agent's state, with their bounds dashed. (c) The same for its input. Where
     the bounds differ between components, (b) and (c) show the component with the largest ratio of error to bound.
+
+    Over a network of messages (b) shows the estimate of one observer, as many links away as there are, within its
+    certified bound, and (c) the largest error of the agent's position and the largest certified bound, of all observers
+    a number of links away.
 
     Args:
         recording: recording of the run.
@@ -50,8 +58,13 @@ def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, age
         figure = Figure(figsize=(13.0, 4.4), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         _draw_positions(left, recording)
-        _draw_observers(middle, recording, recording.states, target, f"(b) Estimates of the state of {name}")
-        _draw_observers(right, recording, recording.inputs, target, f"(c) Estimates of the input of {name}")
+        if isinstance(recording.states, MessageRecord):
+            _draw_box(middle, recording, recording.states, target)
+            _draw_bounds(right, recording, recording.states, target)
+        else:
+            assert recording.inputs is not None
+            _draw_observers(middle, recording, recording.states, target, f"(b) Estimates of the state of {name}")
+            _draw_observers(right, recording, recording.inputs, target, f"(c) Estimates of the input of {name}")
         figure.suptitle(_headline(recording, scenario), fontsize=10.5, color="#333333")
         figure.savefig(path, dpi=150)
     return Path(path)
@@ -74,19 +87,26 @@ STYLE: Any = {
 def _default_agent(recording: Recording, scenario: Scenario) -> int:
     if scenario.figure_agent is not None:
         return scenario.figure_agent
-    layout = recording.design.states.layout
+    layout = recording.states.layout
     return int(layout.target[np.argmax(layout.arrays.observers)]) if len(layout.target) else 0
 
 
 def _headline(recording: Recording, scenario: Scenario) -> str:
     extremes = recording.extremes
+    if isinstance(recording.states, MessageRecord) and recording.error is None:
+        largest, pairs = float(extremes.relative[0]), recording.states.layout.pairs
+        kept = "inside all certified boxes" if largest <= 1.0 + ROUNDING else "a certified box was left"
+        return f"{scenario.name}: {kept}; largest |error| / bound = {_digits(largest)} over all {pairs} pairs"
     ratios = float(np.maximum(extremes.normalized, extremes.input_normalized)[0])  # nan if any is
-    over = f"over all {recording.design.states.layout.pairs} pairs"
+    over = f"over all {recording.states.layout.pairs} pairs"
     if recording.error is not None:
         return f"{scenario.name}: stopped at t = {recording.time[-1]:.4g} s, {_reason(recording)}"
     kept = "inside all funnels" if ratios < 1.0 else "funnels left"
-    digits = f"{ratios:.3f}" if round(ratios, 3) != 1.0 else f"{ratios:.12g}"  # never 1.000 for another number
-    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {digits} {over}"
+    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {_digits(ratios)} {over}"
+
+
+def _digits(ratio: float) -> str:
+    return f"{ratio:.3f}" if round(ratio, 3) != 1.0 else f"{ratio:.12g}"  # never 1.000 for another number
 
 
 def _reason(recording: Recording) -> str:
@@ -191,6 +211,66 @@ def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agen
     units = list(dict.fromkeys(units))
     axes.set_ylabel(f"{text} ({', '.join(units) if len(units) < 3 else 'SI units'})")
     axes.legend(loc="upper right", ncols=2, fontsize=8.5, handlelength=2.4, columnspacing=1.2)
+
+
+def _distances(recording: Recording, record: MessageRecord, agent: int) -> dict[int, int]:
+    """Links from an agent to each of those that estimate it, by observer."""
+    hops = hops_from_targets(recording.design.communication, recording.design.k)
+    return {a: hops[a][i] for a, i in record.layout.slot if i == agent}
+
+
+def _draw_box(axes: Axes, recording: Recording, record: MessageRecord, agent: int) -> None:
+    """One coordinate of an agent's position as the farthest observer estimates it, within its certified bound."""
+    distances, fleet = _distances(recording, record, agent), recording.fleet
+    if not distances:
+        _explain_absence(axes, recording, agent)
+        return
+    observer = max(distances, key=lambda a: (distances[a], -a))
+    component = int(fleet.models[agent].position_index[0])
+    column = record.layout.slot[observer, agent] + component
+    truth, estimate, bound = (
+        values[:, column] for values in (record.truth_per_estimate, record.estimate, record.bound)
+    )
+    links = f"{distances[observer]} link{'s' if distances[observer] > 1 else ''} away"
+    axes.set_title(f"(b) {fleet.ids[agent]} as {fleet.ids[observer]} estimates it, {links}", loc="left")
+    band = estimate - bound, estimate + bound
+    axes.fill_between(record.time, *band, color=_ERROR, alpha=0.18, linewidth=0, label="certified")
+    axes.plot(record.time, estimate, color=_ERROR, label="estimate")
+    axes.plot(record.time, truth, color="black", linewidth=1.0, linestyle=(0, (4, 2)), label="true")
+    axes.set_xlim(0.0, float(record.time[-1]) or 1.0)
+    axes.set_xlabel("time (s)")
+    name, unit = list(fleet.models[agent].states.items())[component]
+    axes.set_ylabel(f"{name} ({unit})")
+    axes.legend(loc="upper right", ncols=3, fontsize=8.5)
+
+
+def _draw_bounds(axes: Axes, recording: Recording, record: MessageRecord, agent: int) -> None:
+    """The largest error and the largest certified bound of an agent's position, by distance of the observers."""
+    distances, fleet = _distances(recording, record, agent), recording.fleet
+    axes.set_title(f"(c) Estimates of the position of {fleet.ids[agent]}", loc="left")
+    if not distances:
+        axes.set_axis_off()
+        return
+    axes.set_yscale("log")
+    for color, hops in zip(_BY_HOPS, sorted(set(distances.values())), strict=False):
+        columns = [
+            record.layout.slot[a, agent] + c
+            for a, distance in distances.items()
+            if distance == hops
+            for c in fleet.models[agent].position_index
+        ]
+        links = f"{hops} link{'s' if hops > 1 else ''}"
+        error, bound = np.abs(record.error[:, columns]).max(axis=1), record.bound[:, columns].max(axis=1)
+        axes.plot(record.time, np.where(bound < np.inf, bound, np.nan), color=color, linestyle=(0, (5, 2)))
+        axes.plot(record.time, np.where(error > 0.0, error, np.nan), color=color, linewidth=1.0, label=links)
+    axes.plot([], [], color="#333333", label="largest |error|")
+    axes.plot([], [], color="#333333", linestyle=(0, (5, 2)), label="largest bound")
+    low, high = axes.get_ylim()
+    axes.set_ylim(max(low, 1e-6 * high), high * (high / max(low, 1e-6 * high)) ** 0.2)  # room for the legend
+    axes.set_xlim(0.0, float(record.time[-1]) or 1.0)
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel(f"max over observers, coordinates ({fleet.position_unit()})")
+    axes.legend(loc="upper right", ncols=2, fontsize=8.5)
 
 
 def _lowest(error: FloatArray, disagreement: FloatArray, rho: FloatArray) -> float:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from khop_env.brief import brief
-from khop_env.observers import Extremes, FloatArray, FunnelBank, FunnelError, Funnels, ObserverDesign, SolveError
+from khop_env.observers import Extremes, FloatArray, FunnelError, ObserverDesign, SolveError
 from khop_env.physics import Fleet
+from khop_env.results.records import MessageRecord, ObserverRecord
 from khop_env.scenarios.scenario import number_of_steps
 from khop_env.simulation import Simulator
 
@@ -32,60 +32,6 @@ Failure = FunnelError | SolveError | StoppedError
 
 
 @dataclass(frozen=True, eq=False)
-class ObserverRecord:
-    """The samples of one kind of observer: of the states (PPSO), or of the inputs' effects g (PPIO).
-
-    Attributes:
-        funnels: observer-target pairs and bounds; the P estimates are in the order of `funnels.layout`.
-        time: (T,) in s.
-        truth: (T, n) true values: the fleet's x, or its g.
-        estimate: (T, P) estimates.
-        disagreement: (T, P) xi, or mu.
-    """
-
-    funnels: Funnels
-    time: FloatArray
-    truth: FloatArray
-    estimate: FloatArray
-    disagreement: FloatArray
-
-    __repr__ = brief
-
-    @property
-    def truth_per_estimate(self) -> FloatArray:
-        """(T, P) the true value of each estimated component."""
-        return self.truth[:, self.funnels.layout.column_source]
-
-    @property
-    def error(self) -> FloatArray:
-        """(T, P) estimation errors x_tilde, or g_tilde."""
-        with np.errstate(invalid="ignore"):  # inf - inf, of diverged states, is nan
-            return self.estimate - self.truth_per_estimate
-
-    @property
-    def rho(self) -> FloatArray:
-        """(T, P) funnels of the disagreements: rho, or omega."""
-        return self._evaluate(self.funnels.rho)
-
-    @property
-    def delta(self) -> FloatArray:
-        """(T, P) bounds on the estimation errors that the observers were designed for: delta, or theta."""
-        return self._evaluate(self.funnels.delta)
-
-    @property
-    def bound(self) -> FloatArray:
-        """(T, P) each observer's own guaranteed bound on the error; at most delta, or theta."""
-        out = np.empty((self.funnels.layout.size, len(self.time)))
-        return self.funnels.error_bounds(self._rows(self.funnels.delta), out).T
-
-    def _evaluate(self, bank: FunnelBank) -> FloatArray:
-        return self._rows(bank).T[:, self.funnels.layout.column_row]
-
-    def _rows(self, bank: FunnelBank) -> FloatArray:
-        return bank.evaluate(self.time, np.empty((len(bank), len(self.time))))
-
-
-@dataclass(frozen=True, eq=False)
 class Recording:
     """Samples of one episode in one environment, with extremes over all steps.
 
@@ -93,8 +39,8 @@ class Recording:
         design: design of the observers, with fleet and graph.
         x: (T, n) states.
         u: (T, m) inputs.
-        states: samples of the state observers.
-        inputs: samples of the input observers; P = 0 if there are none.
+        states: samples of the state observers; of estimates over messages, if the run had a network.
+        inputs: samples of the input observers; P = 0 if there are none, and None under a network.
         extremes: largest ratios over all steps, also those between samples; arrays of shape (1,).
         steps: number of steps taken.
         wall_time: seconds of stepping and sampling, without compilation.
@@ -105,8 +51,8 @@ class Recording:
     design: ObserverDesign
     x: FloatArray
     u: FloatArray
-    states: ObserverRecord
-    inputs: ObserverRecord
+    states: ObserverRecord | MessageRecord
+    inputs: ObserverRecord | None
     extremes: Extremes
     steps: int
     wall_time: float
@@ -170,7 +116,7 @@ def record(
     if not 0.0 < samples_per_second < math.inf:
         raise ValueError(f"samples_per_second must be positive and finite; got {samples_per_second!r}")
     design = simulator.design
-    width = max(1, design.states.layout.size, design.inputs.layout.size)
+    width = max(1, simulator.observers.layout.size, design.inputs.layout.size)
     most_samples = max(2, MOST_ROWS // width)
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
     samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error)
@@ -214,10 +160,18 @@ class _Samples:
             "u": lambda: simulator.u[0],
             "g": lambda: simulator.g[0],
             "estimate": lambda: simulator.estimates[0],
-            "disagreement": lambda: simulator.disagreements()[0],
-            "input_estimate": lambda: simulator.input_estimates[0],
-            "input_disagreement": lambda: simulator.input_disagreements()[0],
         }
+        if simulator.observers.by_messages:
+            self._sources |= {
+                "bound": lambda: simulator.error_bounds().bound[:, 0],
+                "age": lambda: simulator.observers.information(simulator.state).age[:, 0],
+            }
+        else:
+            self._sources |= {
+                "disagreement": lambda: simulator.disagreements()[0],
+                "input_estimate": lambda: simulator.input_estimates[0],
+                "input_disagreement": lambda: simulator.input_disagreements()[0],
+            }
         if task_error is not None:
             self._sources["task_error"] = lambda: np.array([task_error()])
         self._arrays = {name: np.empty((count, len(read()))) for name, read in self._sources.items()}
@@ -232,12 +186,23 @@ class _Samples:
         design = self._simulator.design
         kept = {name: values[: self._taken] for name, values in self._arrays.items()}
         time = kept["time"][:, 0]
+        states: ObserverRecord | MessageRecord
+        if "age" in kept:
+            layout = self._simulator.observers.layout
+            states, inputs = (
+                MessageRecord(layout, time, *(kept[key] for key in ("x", "estimate", "bound", "age"))),
+                None,
+            )
+        else:
+            states = ObserverRecord(design.states, time, kept["x"], kept["estimate"], kept["disagreement"])
+            estimates = kept["input_estimate"], kept["input_disagreement"]
+            inputs = ObserverRecord(design.inputs, time, kept["g"], *estimates)
         return Recording(
             design=design,
             x=kept["x"],
             u=kept["u"],
-            states=ObserverRecord(design.states, time, kept["x"], kept["estimate"], kept["disagreement"]),
-            inputs=ObserverRecord(design.inputs, time, kept["g"], kept["input_estimate"], kept["input_disagreement"]),
+            states=states,
+            inputs=inputs,
             extremes=self._simulator.extremes,
             steps=steps,
             wall_time=wall_time,

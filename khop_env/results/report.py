@@ -69,7 +69,7 @@ def design_report(scenario: Scenario) -> dict[str, Any]:
     radius = {"state": scenario.initial.radius, "input": bound}
     try:  # as the simulator does: its reset checks the initial inputs where g is unbounded
         design.require_feasible_start(scenario.initial.radius, np.where(np.isfinite(bound), bound, 0.0))
-        parts_of_step(scenario.dt, longest, scenario.fleet.ids[agent])
+        parts_of_step(scenario.dt, longest, f"the drift of {scenario.fleet.ids[agent]!r}")
         _require_digits(scenario)
         report["feasible"] = True
     except ValueError as error:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from khop_env.results.recording import ObserverRecord, Recording
+from khop_env.results.recording import Recording
+from khop_env.results.records import MessageRecord, ObserverRecord
 
 if TYPE_CHECKING:
     import polars as pl
@@ -31,11 +32,16 @@ def estimates_table(recording: Recording) -> pl.DataFrame:
         rho: the funnel of the disagreement; omega for inputs.
         delta: the bound on the estimation error that was designed for; theta for inputs.
         bound: this observer's own guaranteed bound on the error, at most delta (theta).
+
+    Over a network of messages there are estimates of states only, of neighbours as well; disagreement, rho and delta
+    are null, since they guarantee nothing there, bound is the certified one (inf where nothing is certified), and there
+    is one column more:
+        age: time since the newest state that has arrived was measured, in s; inf where none has.
     """
     import polars as pl
 
     kinds = zip(QUANTITIES, (recording.states, recording.inputs), strict=True)
-    return pl.concat([_estimates(recording, quantity, kind) for quantity, kind in kinds])
+    return pl.concat([_estimates(recording, quantity, kind) for quantity, kind in kinds if kind is not None])
 
 
 def states_table(recording: Recording) -> pl.DataFrame:
@@ -68,29 +74,29 @@ def states_table(recording: Recording) -> pl.DataFrame:
     return pl.concat(parts)
 
 
-def _estimates(recording: Recording, quantity: str, kind: ObserverRecord) -> pl.DataFrame:
+def _estimates(recording: Recording, quantity: str, kind: ObserverRecord | MessageRecord) -> pl.DataFrame:
     import polars as pl
 
-    fleet, layout, samples = recording.fleet, kind.funnels.layout, len(kind.time)
+    fleet, layout, samples = recording.fleet, kind.layout, len(kind.time)
     names = fleet.component_names()
     components = _distinct([name for _, name, _ in names])
     source = layout.column_source
-    return pl.DataFrame(
-        {
-            "quantity": _labels([quantity], QUANTITIES, samples * layout.size),
-            "time": np.repeat(kind.time, layout.size),
-            "target": _labels([names[c][0] for c in source], fleet.ids, samples),
-            "observer": _labels([fleet.ids[a] for a in layout.observer[layout.column_pair]], fleet.ids, samples),
-            "component": _labels([names[c][1] for c in source], components, samples),
-            "state": kind.truth_per_estimate.ravel(),
-            "estimate": kind.estimate.ravel(),
-            "error": kind.error.ravel(),
-            "disagreement": kind.disagreement.ravel(),
-            "rho": kind.rho.ravel(),
-            "delta": kind.delta.ravel(),
-            "bound": kind.bound.ravel(),
-        }
-    )
+    columns = {
+        "quantity": _labels([quantity], QUANTITIES, samples * layout.size),
+        "time": np.repeat(kind.time, layout.size),
+        "target": _labels([names[c][0] for c in source], fleet.ids, samples),
+        "observer": _labels([fleet.ids[a] for a in layout.observer[layout.column_pair]], fleet.ids, samples),
+        "component": _labels([names[c][1] for c in source], components, samples),
+        "state": kind.truth_per_estimate.ravel(),
+        "estimate": kind.estimate.ravel(),
+        "error": kind.error.ravel(),
+    }
+    if isinstance(kind, MessageRecord):
+        nothing = {name: pl.lit(None, pl.Float64) for name in ("disagreement", "rho", "delta")}
+        known = {"bound": kind.bound.ravel(), "age": kind.age[:, layout.column_pair].ravel()}
+        return pl.DataFrame(columns).with_columns(**nothing).with_columns(**known)
+    widths = {"rho": kind.rho.ravel(), "delta": kind.delta.ravel(), "bound": kind.bound.ravel()}
+    return pl.DataFrame({**columns, "disagreement": kind.disagreement.ravel(), **widths})
 
 
 def _labels(values: Sequence[str], categories: Sequence[str], times: int) -> Any:

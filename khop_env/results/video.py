@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from khop_env.env import BatchedEnv
 from khop_env.extras import how_to_install
 from khop_env.results.metrics import consensus_error
-from khop_env.results.recording import ObserverRecord, Progress, Recording
+from khop_env.results.recording import Progress, Recording
+from khop_env.results.records import MessageRecord, ObserverRecord
 from khop_env.scenarios import Scenario
 from khop_env.tasks import directed
 
@@ -84,11 +85,13 @@ def write_video(
         The path.
 
     Raises:
-        ValueError: if suffix, observer, fps or speed is invalid.
+        ValueError: if suffix, observer, fps or speed is invalid, or the run had a network.
         ModuleNotFoundError: if a package is missing; the message says what to install.
         OSError: if the file can't be written; no partial file is left.
     """
     require_video(path)
+    if isinstance(recording.states, MessageRecord):
+        raise ValueError("a run over a network can't be filmed: frames show continuous exchange")
     from khop_env.env.rendering import Renderer
 
     path = Path(path)
@@ -136,7 +139,8 @@ def _frames(
     progress: Progress | None = None,
 ) -> Iterator[NDArray[np.uint8]]:
     for number, k in enumerate(samples):
-        largest = max(_largest_ratio(kind, k) for kind in (recording.states, recording.inputs))
+        kinds = (kind for kind in (recording.states, recording.inputs) if isinstance(kind, ObserverRecord))
+        largest = max(_largest_ratio(kind, k) for kind in kinds)
         time, x, errors = float(recording.time[k]), recording.x[k], recording.task_error
         error = float(consensus_error(recording.fleet, x)) if errors is None else float(errors[k])
         decorate = None

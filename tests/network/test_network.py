@@ -6,7 +6,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from khop_env.network import PROFILES, Channel, Network, split_networks
+from khop_env.network import PROFILES, Channel, Network
 from khop_env.physics import Links
 
 
@@ -46,19 +46,6 @@ def test_described_in_a_line() -> None:
         Network.of("lossy:loss=0.1..0.3,burst=5,noise=0.1").described()
         == "a message every 50 ms, 10 to 30 % lost in bursts of 5, 30 +- 5 ms late, noise up to 0.1"
     )
-
-
-def test_lists_are_split_at_names() -> None:
-    assert split_networks("ideal,wifi,lossy:loss=0.3,burst=5") == ["ideal", "wifi", "lossy:loss=0.3,burst=5"]
-    assert split_networks("ideal, period=0.1,wifi") == ["ideal:period=0.1", "wifi"]
-    assert split_networks("lossy:loss=0.3,lossy:loss=0.4,burst=2,espnow") == [
-        "lossy:loss=0.3",
-        "lossy:loss=0.4,burst=2",
-        "espnow",
-    ]
-    for text, problem in (("", "nothing between"), ("ideal,,wifi", "nothing between"), ("loss=1", "no name before")):
-        with pytest.raises(ValueError, match=problem):
-            split_networks(text)
 
 
 @pytest.mark.parametrize(
