@@ -74,6 +74,7 @@ SLOW = tuple(
         "benchmarks/test_benchmark.py::test_every_promised_figure_is_printed",
         "env/test_contract.py::test_the_public_checks_pass",
         "env/test_contract.py::test_300_steps",
+        "observers/test_changing_graphs.py",
         "observers/test_funnel_kept.py",
         "observers/test_theorems.py",
         "results/test_report.py::TestFloatingPoint",
