@@ -77,6 +77,7 @@ SLOW = tuple(
         "env/test_contract.py::test_the_public_checks_pass",
         "env/test_contract.py::test_300_steps",
         "env/test_networked_environments.py::test_the_public_checks_pass",
+        "observers/test_changing_graphs.py",
         "observers/test_funnel_kept.py",
         "observers/test_theorems.py",
         "results/test_report.py::TestFloatingPoint",

@@ -70,7 +70,7 @@ def newton_step(
 
 
 @compiled
-def newton_step_weighted(
+def newton_step_one_way(
     eta: int,
     pair: int,
     lanes: int,
@@ -88,33 +88,41 @@ def newton_step_weighted(
     pivot: FloatArray,
     multiplier: FloatArray,
     upper: FloatArray,
-    weight: FloatArray,
+    d_lanes: FloatArray | None,
+    w_lanes: FloatArray | None,
 ) -> None:
-    """`newton_step` for an M that isn't symmetric, or another one in each lane: by LU in its profile.
+    """`newton_step` for an M that isn't symmetric, by LU in its profile; row a of U is upper[a eta : (a + 1) eta].
 
-    Row a of U is upper[a eta : (a + 1) eta]. M's diagonal is `diagonal` (eta, lanes); off it M has minus the entries of
-    `weight` (entries of the target, lanes).
+    Where M differs between lanes, its diagonal is `d_lanes` (eta, lanes), and its other entries are minus `w_lanes`
+    (entries of the target, lanes); otherwise both are None.
     """
-    origin = entry_start[pair]
     for a in range(eta):
         begin, end, row = first[pair + a], last[pair + a], a * eta
         for lane in range(lanes):
-            dz[a, lane] = diagonal[a, lane] * z[a, lane]
+            d = diagonal[pair + a] if d_lanes is None else d_lanes[a, lane]
+            dz[a, lane] = d * z[a, lane]
         for j in range(begin, end + 1):
             at = place(row + j)
             for lane in range(lanes):
                 upper[at, lane] = 0.0
         for k in range(entry_start[pair + a], entry_start[pair + a + 1]):
-            other, from_it = entry_of[k], place(k - origin)
+            other = entry_of[k]
             at = place(row + other)
-            for lane in range(lanes):
-                dz[a, lane] -= weight[from_it, lane] * z[other, lane]
-                upper[at, lane] = -scale[lane] * weight[from_it, lane]
+            if w_lanes is None:
+                for lane in range(lanes):
+                    dz[a, lane] -= z[other, lane]
+                    upper[at, lane] = -scale[lane]
+            else:
+                from_it = place(k - entry_start[pair])
+                for lane in range(lanes):
+                    dz[a, lane] -= w_lanes[from_it, lane] * z[other, lane]
+                    upper[at, lane] = -scale[lane] * w_lanes[from_it, lane]
         at = place(row + a)
         for lane in range(lanes):
+            d = diagonal[pair + a] if d_lanes is None else d_lanes[a, lane]
             normalized = e[a, lane]
             dz[a, lane] = b[a, lane] - normalized - scale[lane] * dz[a, lane]
-            upper[at, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * diagonal[a, lane]
+            upper[at, lane] = 0.5 * (1.0 - normalized * normalized) * gain[a, lane] + scale[lane] * d
         for k in range(begin, a):
             at = place(row + k)
             for lane in range(lanes):

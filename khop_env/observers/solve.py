@@ -29,7 +29,7 @@ import numpy as np
 from khop_env.compiled import compiled, place
 from khop_env.observers.barrier import LONG_STEP, barriers, land, start_anew, start_anew_weighted
 from khop_env.observers.layout import FloatArray, PairArrays
-from khop_env.observers.newton import newton_step, newton_step_weighted
+from khop_env.observers.newton import newton_step, newton_step_one_way
 from khop_env.observers.weights import Weights
 
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
@@ -96,7 +96,7 @@ def solve(
     row_start = np.empty(widest, np.int64)
     of_lanes = np.empty((6, most))
     inv_rho, scale, active, worst, poison = of_lanes[0], of_lanes[1], of_lanes[2], of_lanes[3], of_lanes[4]
-    of_links = np.empty((2 * widest + most_entries if one_way else 0, most))
+    of_links = np.empty((0 if weights is None else 2 * widest + most_entries, most))
     d_lanes, h_lanes, w_lanes = of_links[:widest], of_links[widest : 2 * widest], of_links[2 * widest :]
     evaluations = 0
 
@@ -134,13 +134,6 @@ def solve(
                             d_lanes[a, lane], h_lanes[a, lane] = diagonal_now[pair + a, at], relay_now[pair + a, at]
                         for k in range(entry_start[pair + eta] - origin_of_entries):
                             w_lanes[k, lane] = entry_now[origin_of_entries + k, at]
-            elif one_way:
-                for a in range(eta):
-                    for lane in range(lanes):
-                        d_lanes[a, lane] = diagonal[pair + a]
-                for k in range(entry_start[pair + eta] - entry_start[pair]):
-                    for lane in range(lanes):
-                        w_lanes[k, lane] = 1.0
             for a in range(eta):
                 if weights is not None:
                     for lane in range(lanes):
@@ -176,11 +169,11 @@ def solve(
                     if anew:
                         barriers(eta, lanes, most, flat_u, flat_e, flat_z, flat_gain)
                 if one_way:
-                    newton_step_weighted(
+                    newton_step_one_way(
                         eta,
                         pair,
                         lanes,
-                        d_lanes,
+                        diagonal,
                         entry_start,
                         entry_of,
                         first,
@@ -194,7 +187,8 @@ def solve(
                         pivot,
                         entry,
                         lower,
-                        w_lanes,
+                        None if weights is None else d_lanes,
+                        None if weights is None else w_lanes,
                     )
                 else:
                     newton_step(

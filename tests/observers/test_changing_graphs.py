@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from khop_env.network import Fixed, Outage, RandomLinks, Range
+from khop_env import consensus_v0
+from khop_env.network import Fixed, Outage, RandomLinks, Range, Switching
 from khop_env.observers import (
     BatchedRightHandSide,
     Explicit,
@@ -22,7 +23,11 @@ from khop_env.observers import (
 )
 from khop_env.observers.base import LinksNow
 from khop_env.physics import Fleet, SingleIntegrator, SurfaceVessel
+from khop_env.registry import scenario
+from khop_env.results import design_report
+from khop_env.scenarios.files import ScenarioFileError, read_scenario, write_scenario
 from khop_env.simulation import InitialSet, Simulator
+from khop_env.testing import check_environment
 from tests.strategies import (
     SmoothSignals,
     System,
@@ -274,3 +279,81 @@ def test_without_a_schedule_nothing_is_kept():
     assert simulator.observers.links is None
     assert sorted(simulator.state.memory) == ["eps", "estimate", "input_estimate", "nu"]
     assert simulator.design.states.layout.arrays.last.size == 0
+
+
+class TestCheck:
+    """What `khop check` says of Assumption 3."""
+
+    @staticmethod
+    def why(schedule, **changes) -> str:
+        chosen = scenario("paper").replace(schedule=schedule, **changes)
+        (assumption,) = [each for each in design_report(chosen)["assumptions"] if each["number"] == "3"]
+        assert assumption["status"] == "doesn't hold"
+        return assumption["why"]
+
+    def test_names_the_pairs_that_a_periodic_schedule_cuts_off(self):
+        tree = scenario("paper").communication
+        without = nx.Graph(edge for edge in tree.edges if edge != (4, 7))
+        why = self.why(Switching((tree, without), period=2.0))
+        assert "by construction at the grid points" in why
+        assert "8 of 26 pairs are cut off at times" in why  # agent 7 and those 2 or 3 links away, 2, 3, 5 and 6
+        assert "'drifter_7' from 'drifter_2'" in why
+        assert "'drifter_0' from 'drifter_3'" not in why
+        assert "(at 1 s)" in why
+
+    def test_finds_nobody_cut_off(self):
+        tree = scenario("paper").communication
+        assert "each target reaches all its observers all the time" in self.why(Switching((tree, tree), period=2.0))
+
+    def test_random_schedules_are_drawn(self):
+        assert "in 100 drawn episodes" in self.why(RandomLinks(0.8))
+        assert "who is in range depends on the run" in self.why(Range(3.0))
+
+    def test_bounds_above_delta_are_said(self):
+        """On a ring with chords the sharp rule is used up; without the chords observers are further away."""
+        ring = nx.cycle_graph(8)
+        chords = nx.compose(ring, nx.Graph([(i, i + 4) for i in range(4)]))
+        task = nx.cycle_graph(8)
+        why = self.why(Fixed(ring), communication=chords, task=task, k=4, design_rule="sharp")
+        assert "a part of the links that doesn't change" in why
+        assert "times delta" in why
+
+
+def test_a_file_keeps_the_schedule(tmp_path):
+    schedule = (
+        Switching((PATH, nx.path_graph(4)), period=2.0)
+        & RandomLinks((0.5, 1.0), connected=True)
+        & Range(5.0)
+        & Outage((0.0, 2.0), 1.0)
+        & Outage(1.0, 0.5, link=(0, 1))
+        & Fixed(nx.DiGraph([(0, 1), (1, 0), (1, 2)]))
+    )
+    path = tmp_path / "changing.toml"
+    text = write_scenario(scenario("paper").replace(schedule=schedule))
+    path.write_text(text)
+    again = read_scenario(path)
+    assert write_scenario(again) == text
+    simulators = [each.build(num_envs=3) for each in (scenario("paper").replace(schedule=schedule), again)]
+    for _ in range(10):
+        for simulator in simulators:
+            simulator.step(0.1)
+    np.testing.assert_array_equal(simulators[0].estimates, simulators[1].estimates)
+    path.write_text(text.replace("radius = 5.0", "radus = 5.0"))
+    with pytest.raises(ScenarioFileError, match=r"schedule\[2\]: Range: unknown key 'radus'; did you mean 'radius'"):
+        read_scenario(path)
+
+
+def test_a_scenario_refuses_links_that_it_does_not_have():
+    with pytest.raises(ValueError, match=r"scenario 'paper': Fixed.graph has 2 links that the communication graph"):
+        scenario("paper").replace(schedule=Fixed(nx.Graph([(0, 7)])))
+
+
+def test_the_environment_keeps_its_contract():
+    schedule = RandomLinks((0.5, 1.0)) & Outage((0.0, 0.5), 0.3) & Range(30.0)
+    changing = scenario("paper").replace(schedule=schedule)
+    report = check_environment(lambda **options: consensus_v0.parallel_env(changing, max_cycles=15, **options))
+    assert report.ok, str(report)
+    env = consensus_v0.parallel_env(changing, bounds=True)
+    observations, _ = env.reset(seed=0)
+    for agent, observation in observations.items():
+        assert env.observation_space(agent).contains(observation)  # a bound of inf is clipped
