@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.compiled import compiled, place
-from khop_env.observers.barrier import barrier, barriers, eps_near_impulse
+from khop_env.elementary import expm1
+from khop_env.observers.barrier import barrier, eps_near_impulse
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays
 from khop_env.observers.solve import LANES
 
@@ -50,8 +51,9 @@ def solve_alone(
     pairs = PairArrays(*pairs)
     batch = due.size
     lanes = np.empty((10, LANES))
-    target, weight, inverse, total, u = lanes[0], lanes[1], lanes[2], lanes[3], lanes[4]
-    e, z, gain, active, answer = lanes[5], lanes[6], lanes[7], lanes[8], lanes[9]
+    target, weight, inverse, total = lanes[0], lanes[1], lanes[2], lanes[3]
+    u, active, answer = lanes[4], lanes[5], lanes[6]
+    steps, slope, at_u = lanes[7], lanes[8], lanes[9]
     for i in range(pairs.observers.size):
         n = pairs.components[i]
         for a in range(pairs.observers[i]):
@@ -74,7 +76,7 @@ def solve_alone(
                         target[lane] = (d * estimate[column, at] - total[lane]) * inverse[lane]
                         weight[lane] = d * tau * inverse[lane] * inverse[lane]
                         u[lane] = eps[column, at]
-                    _newton(width, target, weight, u, e, z, gain, active, answer)
+                    _solve_lanes(width, target, weight, u, active, steps, slope, at_u, answer)
                     for lane in range(width):
                         at = place(first + lane)
                         if due[at]:
@@ -85,37 +87,55 @@ def solve_alone(
 
 
 @compiled
-def _newton(
+def _solve_lanes(
     width: int,
     target: FloatArray,
     weight: FloatArray,
     u: FloatArray,
-    e: FloatArray,
-    z: FloatArray,
-    gain: FloatArray,
     active: FloatArray,
+    steps: FloatArray,
+    slope: FloatArray,
+    normalized: FloatArray,
     answer: FloatArray,
 ) -> None:
-    """Newton's method from warm starts u; where it isn't quick, anew between bounds. Writes u and e, the `answer`."""
+    """Halley's method in eps from warm starts `u`; where it isn't quick, anew between bounds. Writes u and e.
+
+    With q = de/deps = (1 - e^2) / 2 and z = eps / q, the excess F = e + s d z - b and its derivatives, times q, are
+
+        A = q (e - b) + s d eps,   B = q^2 + s d (1 + eps e),   C = s d (2 e + eps (q + e^2)) - q^2 e.
+    """
     for lane in range(width):
         active[lane] = 1.0
-    moving = True
     for _ in range(_FEW):
-        barriers(1, width, LANES, u, e, z, gain)
-        worst = 0.0
+        for lane in range(width):  # arithmetic alone, which runs in vector registers
+            eps, sd = u[lane], weight[lane]
+            size = abs(eps)
+            growth = expm1(size)
+            half = 1.0 / (growth + 2.0)
+            e = math.copysign(growth * half, eps)
+            q = 2.0 * (growth + 1.0) * half * half
+            excess = q * (e - target[lane]) + sd * eps
+            first = q * q + sd * (1.0 + eps * e)
+            second = sd * (2.0 * e + eps * (q + e * e)) - q * q * e
+            steps[lane] = 2.0 * excess * first / (2.0 * first * first - excess * second)
+            slope[lane], normalized[lane] = q, e
+        moving = 0.0
         for lane in range(width):
-            slope = 0.5 * (1.0 - e[lane] * e[lane])
-            step = (e[lane] + weight[lane] * z[lane] - target[lane]) / (slope + weight[lane] / gain[lane])
-            step = min(max(step, -_LONGEST), _LONGEST)  # the exponential is far from linear, and ends at 700
+            step = steps[lane]
+            # far away the exponential is nothing like a parabola, and 700 is its end
+            step = step if step < _LONGEST else _LONGEST
+            step = step if step > -_LONGEST else -_LONGEST
             # a lane that has converged stays: its result mustn't depend on the others
-            on = active[lane] > 0.0
-            u[lane] -= step if on else 0.0
-            answer[lane] = e[lane] - slope * step if on else answer[lane]
-            active[lane] = 1.0 if on and not abs(step) <= _SMALL else 0.0
-            worst = max(worst, active[lane])
-        moving = worst > 0.0
-        if not moving:
-            return
+            on = active[lane]
+            u[lane] -= on * step
+            answer[lane] = normalized[lane] - slope[lane] * step if on > 0.0 else answer[lane]
+            active[lane] = on if abs(step) > _SMALL else 0.0
+            moving += active[lane]
+        if moving == 0.0:
+            break
+    for lane in range(width):
+        if not abs(answer[lane]) < 1.0:
+            active[lane] = 1.0  # not a number: that is found between bounds, or stays
     for lane in range(width):
         if active[lane] > 0.0:
             u[lane], answer[lane] = _between_bounds(target[lane], weight[lane])
