@@ -73,7 +73,7 @@ def assert_inside(simulator: Simulator) -> None:
     assert np.all(np.isfinite(simulator.input_estimates))
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(system=changing_systems(), batch=st.integers(1, 3))
 def test_matrices_and_bounds_are_those_of_the_links_that_are_up(system, batch):
     """xi = M(t) x_tilde and the bound M(t)^-1 rho over the observers that the target reaches, from the definitions of
@@ -102,7 +102,7 @@ def test_matrices_and_bounds_are_those_of_the_links_that_are_up(system, batch):
 
 
 @pytest.mark.parametrize("order", [1, 2])
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(system=changing_systems(), dt=STEPS, decades=st.floats(-1.0, 2.0), batch=st.integers(1, 3))
 def test_funnels_and_own_bounds_are_kept_whatever_links_do(order, system, dt, decades, batch):
     """At every grid point, for random digraphs, schedules, fleets and steps, under jumps of states and inputs."""
@@ -119,7 +119,7 @@ def test_funnels_and_own_bounds_are_kept_whatever_links_do(order, system, dt, de
         assert np.all(error < simulator.error_bounds().bound)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(system=changing_systems(), dt=STEPS)
 def test_alone_as_in_a_batch_and_from_any_saved_state(system, dt):
     """Bit for bit: an environment alone, one that was saved halfway, and one that was pickled."""
@@ -143,7 +143,7 @@ def test_alone_as_in_a_batch_and_from_any_saved_state(system, dt):
     np.testing.assert_array_equal(other.error_bounds().bound, batch.error_bounds().bound)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(system=systems() | systems(directed=True), dt=STEPS)
 def test_with_all_links_up_it_is_the_fixed_graph(system, dt):
     """To the same bits where links go one way, and to rounding where another factorisation is used."""
@@ -164,7 +164,7 @@ def test_with_all_links_up_it_is_the_fixed_graph(system, dt):
         np.testing.assert_allclose(free.error_bounds().bound, fixed.error_bounds().bound, rtol=1e-9)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(system=changing_systems(input_observer=True), env=st.integers(0, 1))
 def test_a_run_by_messages_equals_the_batched_one(system, env):
     """Each agent reads what came over the links that are up, and passes on who has reached it."""
