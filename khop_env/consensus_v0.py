@@ -61,6 +61,9 @@ neighbours are estimated, too, and slots say how old the information is that an 
 With `observe="oracle"` all slots have true states and are valid; with `observe="local"` neighbours are estimated from
 messages, and the slots of k-hop targets are zeros.
 
+Without a network, but with links that come and go (`Scenario.schedule`), the state of a neighbour whose link is down is
+zeros in its slot, and `valid`, `heard` and `hops` are 0; estimates of k-hop targets go on.
+
 ### Action Space
 
 Each agent's inputs as fractions of their limits, in [-1, 1]; larger values are clipped and counted in the infos. With
