@@ -61,6 +61,9 @@ neighbours are estimated, too, and slots say how old the information is that an 
 With `observe="oracle"` all slots have true states and are valid; with `observe="local"` neighbours are estimated from
 messages, and the slots of k-hop targets are zeros.
 
+Without a network, but with links that come and go (`Scenario.schedule`), the state of a neighbour whose link is down is
+zeros in its slot, and `valid`, `heard` and `hops` are 0; estimates of k-hop targets go on.
+
 ### Action Space
 
 Each agent's inputs as fractions of their limits, in [-1, 1]; larger values are clipped and counted in the infos. With
@@ -117,7 +120,8 @@ up to 12 agents, or a square grid
 `dt`: the simulator's step in s; the control period has to be a multiple of it, and is one step by default
 
 `order`: order of the simulator's step, 1 (default) or 2: actions are held over a control period, so that the closed
-loop is of order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time
+loop is of order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time. Under a
+network 1
 
 `actuator`: "direct" (default), "lag", "slew", "hold", or one of `khop_env.env` with parameters, e.g.
 `Lag(time_constant=0.2)`; all but the first keep the derivative of the inputs bounded, as the input observer's theorem
@@ -132,7 +136,7 @@ requires (Assumption 2-ii of the paper)
 `limit`: bound on positions and other states in observations, in their units, and on ages in s (default 100); larger
 values are clipped and counted in the infos
 
-`threads`: of the observers' solve (default 1)
+`threads`: of the observers' solve (default 1); not used under a network
 
 `network`: how messages are exchanged: a profile ("ideal", "urllc", "factory", "wifi", "lossy", "saturation", "espnow",
 "crazyradio"), also with other values ("lossy:period=0.1,loss=0.1..0.3,burst=5"), a `khop_env.network.Network` or a

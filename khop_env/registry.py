@@ -295,6 +295,11 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
                 "network='wifi'"
             )
         return settings, Proximal(settings.order, settings.threads)
+    if settings.order != 1:
+        raise ValueError(
+            f"order={settings.order} is of simulators without a network; under one steps are of order 1: leave it out, "
+            "and choose a shorter dt for more accuracy"
+        )
     estimator = settings.estimator or scenario.estimator
     chosen = dataclasses.replace(settings, network=network, estimator=estimator)
     return chosen, Networked(network, estimator)

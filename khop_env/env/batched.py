@@ -92,7 +92,8 @@ class BatchedEnv:
         self._scale = np.where(np.isfinite(self._limit), self._limit, 1.0)
         observers = simulator.observers
         bounded = len(state.memory["estimate"]) if self._read_observations.uses_bounds else 0
-        known = 4 * observers.layout.pairs if observers.by_messages else 0
+        changing = len(simulator.design.links) if simulator.design.schedule is not None else 0
+        known = 4 * observers.layout.pairs if observers.by_messages else changing
         self._sources = Sources(
             state.x,
             state.memory["estimate"],
@@ -291,8 +292,10 @@ class BatchedEnv:
         observers, state = self.simulator.observers, self.simulator.state
         if sources.bound.size:
             observers.bound(state, sources.bound)
-        if sources.known.size:
+        if observers.by_messages:
             summarize(*observers.information(state), state.t, self.settings.control_period, sources.known)
+        elif sources.known.size:
+            sources.known[...] = observers.links_up(state)
         if sources.task.size:
             self.task.observe(self.world, sources.task)
         flat = self._read_observations(sources, clipped)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -73,6 +74,7 @@ class ObservationColumns:
         design = world.design
         self._world, self._task, self._design, self._fleet, self._observe = world, task, design, design.fleet, observe
         self._layout, self._by_messages = observers.layout, observers.by_messages
+        self._changing = design.schedule is not None and not observers.by_messages
         self._bounds, self._uniform, self._limit, self._inputs = bounds, uniform, world.limit, inputs
         models = self._fleet.models
         self._types = list(dict.fromkeys(model.type for model in models))
@@ -128,8 +130,11 @@ class ObservationColumns:
         fleet, name, model = self._fleet, f"slot{number}", self._fleet.models[slot.agent]
         estimated = self._by_messages or not slot.heard  # otherwise its state is received
         estimate = estimated and self._observe != "oracle"
+        gate = -1  # a neighbour's state is received while its link is up
+        if self._changing and slot.heard and self._observe != "oracle":
+            gate = self._design.links.index[slot.agent, i]
         columns = [
-            *self._known_columns(i, name, slot, estimate),
+            *self._known_columns(i, name, slot, estimate, gate),
             _flag(f"{name}.task_edge", slot.task_edge),
             *(self._type(name, model.type) if len(self._types) > 1 else ()),
         ]
@@ -143,11 +148,14 @@ class ObservationColumns:
                 relative,
                 origin + feature.component,
                 int(own),
+                gate=gate,
             )
             for axis, feature, own in zip(self._axes, position, fleet.position_index[i], strict=True)
         ]
         columns += [
-            _state(name, feature, (_ESTIMATE if estimate else _STATE)[feature.how], origin, self._limit)
+            replace(
+                _state(name, feature, (_ESTIMATE if estimate else _STATE)[feature.how], origin, self._limit), gate=gate
+            )
             for feature in rest
         ]
         columns += self._padding(name, self._most_rest - len(rest))
@@ -157,11 +165,12 @@ class ObservationColumns:
             return [Column(column.field) for column in columns]
         return columns
 
-    def _known_columns(self, i: int, name: str, slot: Slot, estimate: bool) -> list[Column]:
+    def _known_columns(self, i: int, name: str, slot: Slot, estimate: bool, gate: int) -> list[Column]:
         """Whether, when and over how many links something has arrived about the agent: constants without messages."""
         if not self._by_messages:
             hops = Column(Field(f"{name}.hops", "", 0.0, float(self._design.k)), value=float(slot.hops))
-            return [_flag(f"{name}.valid", True), _flag(f"{name}.heard", slot.heard), hops]
+            flags = [_flag(f"{name}.valid", True), _flag(f"{name}.heard", slot.heard), hops]
+            return flags if gate < 0 else [Column(flag.field, KNOWN, gate) for flag in flags]  # one hop: all are 1 or 0
         layout, most_hops = self._layout, float(max(self._design.k, len(self._fleet) - 1))  # detours are possible
         pair = int(layout.column_pair[layout.slot[i, slot.agent]])
         valid, *others = (
@@ -207,14 +216,7 @@ class ObservationColumns:
         high = np.max([[column.field.high for column in its_columns] for its_columns in columns], axis=0)
         return [
             [
-                Column(
-                    Field(column.field.name, column.field.unit, a, b),
-                    column.kind,
-                    column.row,
-                    column.origin,
-                    column.value,
-                    column.bounds,
-                )
+                replace(column, field=Field(column.field.name, column.field.unit, a, b), clip=column.bounds)
                 for column, a, b in zip(its_columns, low.tolist(), high.tolist(), strict=True)
             ]
             for its_columns in columns

@@ -32,6 +32,7 @@ class Column:
         origin: the row of the states that a relative position is taken from, or -1.
         value: of a constant.
         clip: smallest and largest value, if narrower than the field's: where agents of several types share one space.
+        gate: row of the known quantities that the value is multiplied by, or -1.
     """
 
     field: Field
@@ -40,6 +41,7 @@ class Column:
     origin: int = -1
     value: float = 0.0
     clip: tuple[float, float] | None = None
+    gate: int = -1
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -56,7 +58,8 @@ class Sources(NamedTuple):
         bound: (P, B) guaranteed bounds on their errors; not read unless `Readout.uses_bounds`.
         inputs: (m, B) inputs in force, as fractions of their limits.
         task: (rows, B) values of the task's live columns.
-        known: (4 pairs, B) the quantities that `summarize` writes, of observers that exchange messages; else no rows.
+        known: (4 pairs, B) the quantities that `summarize` writes, of observers that exchange messages; without
+            messages (L, B) whether each link is up, where links come and go.
     """
 
     x: FloatArray
@@ -74,6 +77,7 @@ class _LiveColumns(NamedTuple):
     kind: IntArray
     row: IntArray
     origin: IntArray
+    gate: IntArray
     owner: IntArray
     low: FloatArray
     high: FloatArray
@@ -103,6 +107,7 @@ class Readout:
             np.array(kinds, np.int64),
             np.array(rows, np.int64),
             np.array([columns[q].origin for q in live], np.int64),
+            np.array([columns[q].gate for q in live], np.int64),
             np.array([owner[q] for q in live], np.int64),
             np.ascontiguousarray(bounds[:, 0]),
             np.ascontiguousarray(bounds[:, 1]),
@@ -170,6 +175,10 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
             else:
                 for e in range(width):
                     values[e] = np.sin(estimate[row, first + e])
+            gate = live.gate[q]
+            if gate >= 0:
+                for e in range(width):
+                    values[e] = values[e] * sources.known[gate, first + e] + 0.0  # no -0.0, whose sign would tell
             outside = 0
             for e in range(width):
                 outside += (values[e] < low) | (values[e] > high)

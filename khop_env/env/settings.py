@@ -31,11 +31,12 @@ class Settings:
         control_period: time between actions in s.
         dt: the simulator's step in s; the control period by default.
         order: of the simulator's step, 1 or 2. Actions are held over a control period, so that the closed loop is of
-            order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time.
+            order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time. Under a
+            network 1.
         actuator: "direct", "lag", "slew", "hold", or an `Actuator`.
         limit: bound on positions and other states in observations, in their own units, and on ages in s; values beyond
             are clipped.
-        threads: of the observers' solve.
+        threads: of the observers' solve; not used under a network.
         network: how messages are exchanged: a profile's name, also with other values as in "lossy:period=0.1,loss=0.3",
             a `Network` or a mapping of its values; None for the scenario's own, which by default is none: exchange in
             continuous time.

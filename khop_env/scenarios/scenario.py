@@ -73,7 +73,7 @@ class Scenario:
         law: name and parameters of the default feedback law.
         duration: length of an experiment in s.
         dt: step in s.
-        order: of the proximal step.
+        order: of the proximal step; not used under a network.
         network: how messages are exchanged, also by name ("wifi") or as a mapping; None: exchange in continuous time.
         estimator: from messages to estimates under a network, "ppso" or "relay", or an `Estimator`.
         figure_agent: index of the agent whose estimates figures show; None for the agent with most observers.

@@ -18,6 +18,7 @@ from khop_env.testing.subject import Fault, Subject, called, play
 from khop_env.testing.views import copies
 
 _VISIBLE = ("t", "x", "estimate")  # the parts of the simulator's state that observations may depend on
+_OF_LINKS = ("key",)  # with changing links, and without messages, which of them are up
 _OF_PAIRS = ("bound", "stamp", "hops", "arrived")  # and under a network what an agent knows of its own estimates
 _LOSS = 0.5  # of messages, so that about half of an agent's neighbours don't get its next one
 
@@ -43,7 +44,7 @@ def leak(subject: Subject) -> None:
         for name in _OF_PAIRS if observers.by_messages else ():
             _require(env, {j}, f"{agent!r}'s {name}", _array(name), [made[0] if name == "bound" else made[1]])
     for name in env.get_state().simulator.arrays():
-        if name not in _VISIBLE and not (observers.by_messages and name in _OF_PAIRS):
+        if name not in (*_VISIBLE, *(_OF_PAIRS if observers.by_messages else _OF_LINKS)):
             _require(env, set(), f"the simulator's {name}", _array(name), [...])
     if isinstance(observers, Networked) and mode != "oracle":
         _lost_messages(env, observers, subject.seed)

@@ -17,6 +17,10 @@ from tests.env.playing import built, parallel, play, same, state
         ({"network": {"los": 0.2}}, "no key 'los'; did you mean 'loss'"),
         ({"network": "wifi", "estimator": "rely"}, "no estimator 'rely'; did you mean 'relay'?"),
         ({"network": "wifi", "estimator": 3}, r"an estimator is a name \(.*\) or an Estimator; got 3"),
+        (
+            {"network": "wifi", "order": 2},
+            "order=2 is of simulators without a network; under one steps are of order 1",
+        ),
         ({"estimator": "relay"}, "estimator: 'relay' makes estimates from messages, and there is no network"),
     ],
 )
