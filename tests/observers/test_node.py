@@ -131,7 +131,7 @@ def test_a_round_by_hand() -> None:
 @pytest.mark.parametrize("name", ["paper", "mixed_fleet"])
 def test_nodes_equal_the_batch(name: str, estimator: str) -> None:
     """With losses, delays, reordering, noise, and steps shorter than the period."""
-    chosen, network = scenario(name), Network(0.1, loss=0.3, burst=3, latency=0.15, jitter=0.1)
+    chosen, network = scenario(name), Network(0.1, loss=0.3, burst=3, latency=0.15, jitter=0.1, noise=0.02)
     design, fleet, h = chosen.design, chosen.design.fleet, 0.01
     simulator = chosen.build(law=make_law(chosen.law), observers=Networked(network, estimator))
     simulator.reset(seed=3)
