@@ -72,21 +72,24 @@ def _lost_messages(env: KHopEnv, observers: Networked, seed: int) -> None:
     fleet, links, saved = env.batched.fleet, env.batched.simulator.design.links, env.get_state()
     actions = {agent: np.zeros(env.action_space(agent).shape, np.float32) for agent in env.agents}
 
-    def after(state: EnvState) -> dict[str, Any]:
+    def after(state: EnvState) -> tuple[dict[str, Any], NDArray[np.bool_], int]:
+        """The next observations, over which links something has arrived by then, and the rounds in between."""
         env.set_state(state)
-        return env.step(actions)[0]
+        observations = env.step(actions)[0]
+        memory = env.get_state().simulator.memory
+        first, last = int(state.simulator.memory["channel.round"][0]), int(memory["channel.round"][0])
+        return observations, memory["channel.newest"][:, 0] > first, last - first
 
-    expected = after(saved)
-    first, last = (int(each.simulator.memory["channel.round"][0]) for each in (saved, env.get_state()))
-    newest = env.get_state().simulator.memory["channel.newest"][:, 0]
+    expected, arrived, rounds = after(saved)
     for j, agent in enumerate(fleet.ids):
-        reached = {j}
-        for _ in range(last - first):
-            over = [(links.sender[link], links.receiver[link]) for link in np.flatnonzero(newest > first)]
-            reached |= {int(receiver) for sender, receiver in over if sender in reached}
         edited = copy.deepcopy(saved)
         edited.simulator.x[fleet.state_slice(j)] += 0.1
-        for other, observation in after(edited).items():
+        found, arrived_now, _ = after(edited)
+        over = np.flatnonzero(arrived | arrived_now)  # whether links are up may depend on where agents are
+        reached = {j}
+        for _ in range(rounds):
+            reached |= {int(links.receiver[link]) for link in over if int(links.sender[link]) in reached}
+        for other, observation in found.items():
             if fleet.agent(other) not in reached and (text := difference(expected[other], observation, "entry")):
                 raise Fault(
                     f"the true state of {agent!r} changes the next observation of {other!r}, although no message of "
