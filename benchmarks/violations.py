@@ -1,4 +1,4 @@
-"""Search for errors above their certified bounds: random fleets, graphs and networks, adversarial inputs.
+"""Search for errors above their certified bounds: random fleets, graphs, schedules and networks, adversarial inputs.
 
 python -m benchmarks.violations 1e9         # so many pairs of agents, times environments, times steps
 """
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import networkx as nx
 import numpy as np
 
-from khop_env.network import Network
+from khop_env.network import Network, Outage, RandomLinks, Range, Schedule, Switching
 from khop_env.observers import ESTIMATORS, Exponential, FloatArray, Networked
 from khop_env.physics import (
     AgentModel,
@@ -182,10 +182,24 @@ def _scenario(rng: np.random.Generator) -> Scenario:
         k=int(rng.integers(2, 5)),
         relay=relay,
         delta=dict.fromkeys(types, Exponential(1.0, 0.1, 2.0)),
+        schedule=_schedule(communication, rng),
         theta=dict.fromkeys(observed, Exponential(1.0, 0.5, 2.0)),
         disturbance=noisy,
         radius=float(rng.choice([0.1, 1.0])),
     ).sized()
+
+
+def _schedule(graph: nx.Graph, rng: np.random.Generator) -> Schedule | None:
+    """All links always, in half of the cases; or links that come and go."""
+    fewer = graph.copy()
+    fewer.remove_edges_from([edge for edge in graph.edges if rng.random() < 0.5])
+    schedules: list[Schedule] = [
+        RandomLinks(float(rng.random()), both_ways=bool(rng.random() < 0.5)),
+        Switching((graph, fewer), period=float(rng.uniform(0.1, 3.0))),
+        Outage(start=(0.0, 2.0), duration=(0.1, 2.0)) & Outage(start=(0.0, 2.0), duration=(0.1, 2.0)),
+        Range(float(rng.uniform(0.1, 3.0))),
+    ]
+    return schedules[rng.integers(len(schedules))] if rng.random() < 0.5 else None
 
 
 def _ways(i: int, j: int, rng: np.random.Generator) -> list[tuple[int, int]]:

@@ -53,6 +53,7 @@ SLOW = tuple(
         "test_cli_agents.py",
         "test_cli_contract.py",
         "test_cli_folders.py",
+        "test_cli_network.py",
         "test_cli_objects.py",
         "test_cli_train.py",
         "test_compiled.py::test_a_change_in_another_file_is_seen",

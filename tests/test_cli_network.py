@@ -45,7 +45,10 @@ class TestNetwork:
         assert max(map(len, found.splitlines())) <= 80
         text = " ".join(found.split())
         assert "paper under tanh on estimates, 2 episodes, the same for every row" in text
-        assert "why not just pass states on? At the same messages the mean error of the paper's observers" in text
+        assert (
+            "why not just pass states on? At the same times of messages, which are 1.9 times as long, the mean error"
+            in text
+        )
         assert "errors above their certified bounds, start included: 0 of" in text
         assert "continuous exchange, without messages: error" in text
 

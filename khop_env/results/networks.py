@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from khop_env.network import Network
-from khop_env.observers import IntArray, Networked, Observers, PairLayout, Proximal
+from khop_env.observers import IntArray, Message, Networked, ObserverDesign, Observers, PairLayout, Proximal
+from khop_env.observers.wire import EstimatorName
 from khop_env.results.metrics import finite, violations
 from khop_env.scenarios import Scenario
 from khop_env.scenarios.scenario import number_of_steps
@@ -177,8 +178,18 @@ def _measured(simulator: Simulator, name: str, network: Network | None, duration
         violations=wrong,
         pair_steps=layout.pairs * simulator.num_envs * steps,
         messages_per_s=None if network is None else 1.0 / network.period,
-        bytes_per_message=None,
+        bytes_per_message=_bytes(simulator.design, observers),
     )
+
+
+def _bytes(design: ObserverDesign, observers: Observers) -> int | None:
+    """Bytes of the largest message of an agent; None where there are none, or for an estimator of a user's own."""
+    if not isinstance(observers, Networked):
+        return None
+    for name in get_args(EstimatorName):
+        if name == observers.estimator.name:
+            return max(Message.size(design, agent, name) for agent in range(len(design.fleet)))
+    return None
 
 
 def _positions(simulator: Simulator, layout: PairLayout) -> IntArray:

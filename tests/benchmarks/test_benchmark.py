@@ -59,7 +59,14 @@ def test_every_promised_figure_is_printed():
         "growth_memory",
         "training",
         "training_environment_share",
+        "network_relay_ratio",
+        "network_ppso_ratio",
+        "continuous_memory",
+        "relay_memory",
+        "ppso_memory",
+        "error_to_certified_bound",
     } <= set(rows)
+    assert rows.pop("violations") == 0
     assert PARTS | RATES | {"environment_control_period", "environment_substeps"} <= set(rows)
     assert (rows["environment_control_period"], rows["environment_substeps"]) == (0.05, 1)
     assert all(np.isfinite(value) and value > 0 for value in rows.values())
@@ -132,6 +139,8 @@ def quick_parts(monkeypatch):
         monkeypatch.setattr(module, name, lambda add, *rest, index=index: add(f"row {index}", 1.0))
     monkeypatch.setattr(module, "_ratio_to_floor", lambda quick: 2.0)
     monkeypatch.setattr(module, "environment_rows", lambda report, *rest: report.add("row 2", np.inf))
+    monkeypatch.setattr(module, "network_rows", lambda report, *rest: report.add("row 3", 1.0))
+    monkeypatch.setattr(module, "violation_rows", lambda report, *rest: report.add("row 4", 0.0))
 
 
 class NotInstalled:
@@ -161,6 +170,8 @@ def test_without_the_extras_the_rest_is_measured(quick_parts, monkeypatch):
         ("ratio_to_floor", 2.0, None),
         ("row 1", 1.0, None),
         ("row 2", None, "came out as inf"),
+        ("row 3", 1.0, None),
+        ("row 4", 0.0, None),
         ("training", None, f"needs stable_baselines3 and torch: {how}"),
         ("training_environment_share", None, f"needs stable_baselines3 and torch: {how}"),
     ]
@@ -180,7 +191,7 @@ def test_what_was_measured_is_not_lost(quick_parts, monkeypatch, error):
         assert [row["name"] for row in report["rows"]] == ["row 0"]
         assert (report["failed"], report["interrupted"]) == ([], True)
     else:
-        assert len(report["rows"]) == 6
+        assert len(report["rows"]) == 8
         assert report["rows"][1]["skipped"] == "failed: RuntimeError: broken"
         assert report["failed"] == [
             "proximal against SciPy's stiff solvers",

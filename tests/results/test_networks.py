@@ -8,7 +8,7 @@ import pytest
 
 from agents import make_law
 from khop_env.network import Network
-from khop_env.observers import Exponential, Networked
+from khop_env.observers import Exponential, Message, Networked
 from khop_env.physics import SingleIntegrator
 from khop_env.results import measure_networks, network_figure
 from khop_env.results.metrics import violations
@@ -66,6 +66,8 @@ def test_a_row_is_what_a_simulator_says():
     assert row.pair_steps == layout.pairs * 3 * 100
     assert (row.network, row.estimator, row.period, row.loss) == ("wifi:period=0.1,loss=0.3", "ppso", 0.1, 0.3)
     assert row.messages_per_s == pytest.approx(10.0)
+    sizes = [Message.size(scenario.design, agent, "ppso", "float32") for agent in range(8)]
+    assert row.bytes_per_message == max(sizes) > min(sizes)
 
 
 def test_rows_are_in_order_of_network_estimator_and_period():
