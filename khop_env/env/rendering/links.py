@@ -1,0 +1,105 @@
+"""Communication links in a frame."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from khop_env.env.rendering.canvas import Canvas
+from khop_env.env.rendering.looks import EDGE_COLOR, mix
+from khop_env.env.rendering.scene import Scene
+from khop_env.observers import FloatArray
+from khop_env.physics import Links
+
+_KEPT = 0.75  # of the colour, per round that a message is missing
+_FAINTEST = 0.15
+_DOWN = 0.45  # of the colour of a link that is down
+
+
+class Stroke(NamedTuple):
+    """How a link is drawn.
+
+    Attributes:
+        color: its red, green and blue.
+        dashed: whether it is down.
+    """
+
+    color: tuple[int, int, int]
+    dashed: bool = False
+
+
+FRESH, DOWN = Stroke(mix(EDGE_COLOR, 1.0)), Stroke(mix(EDGE_COLOR, _DOWN), True)
+
+
+def faded(missed: float) -> Stroke:
+    """The stroke of a link whose newest message is `missed` rounds older than it had to be."""
+    return Stroke(mix(EDGE_COLOR, max(_FAINTEST, _KEPT**missed)))
+
+
+class LinkLines:
+    """Draws the links of a graph: a line where they go both ways, an arrow where they go one way.
+
+    A link that is down is dashed, and one whose newest messages are lost fades from round to round. Of a line, the half
+    beside an agent shows the link by which this agent receives.
+
+    Args:
+        links: of the graph.
+        radius: of agents' markers in pixels.
+        thin: scale of the lines' width.
+    """
+
+    def __init__(self, links: Links, radius: float, thin: float) -> None:
+        self._radius, self._thin = radius, thin
+        self.pairs = sorted({(min(pair), max(pair)) for pair in links.index})
+        self._ways = [(links.index.get((i, j)), links.index.get((j, i))) for i, j in self.pairs]
+
+    def draw(self, canvas: Canvas, middles: FloatArray, scene: Scene) -> None:
+        """Draw them between agents at the pixels `middles` (N, 2); nan where an agent isn't drawn."""
+        heads = []
+        for pair, (there, back) in zip(self.pairs, self._ways, strict=True):
+            ends = middles[list(pair)]
+            if not np.isfinite(ends).all():
+                continue
+            if there is None or back is None:
+                ends = ends if back is None else ends[::-1]
+                stroke = stroke_of(scene, back if there is None else there)
+                self._line(canvas, ends, stroke)
+                heads.append((ends, stroke.color))
+                continue
+            strokes = stroke_of(scene, there), stroke_of(scene, back)
+            if strokes[0] == strokes[1]:
+                self._line(canvas, ends, strokes[0])
+                continue
+            middle = ends.mean(axis=0)
+            for stroke, receiver in zip(strokes, ends[::-1], strict=True):
+                self._line(canvas, np.array([middle, receiver]), stroke)
+        for ends, color in heads:  # above all lines
+            draw_arrow_head(canvas, ends, 1.6 * self._radius, self._thin, color)
+
+    def _line(self, canvas: Canvas, ends: FloatArray, stroke: Stroke) -> None:
+        draw_link(canvas, ends, stroke, self._thin)
+
+
+def stroke_of(scene: Scene, link: int) -> Stroke:
+    """How a link is drawn at an instant."""
+    if scene.up is not None and not scene.up[link]:
+        return DOWN
+    return FRESH if scene.messages is None else faded(float(scene.messages.missed[link]))
+
+
+def draw_link(canvas: Canvas, ends: FloatArray, stroke: Stroke, thin: float) -> None:
+    """A line between two points (2, 2)."""
+    if stroke.dashed:
+        canvas.dashes(ends[0], ends[1], stroke.color, 1.5 * thin, 3.0 * thin, 5.0 * thin)
+    else:
+        canvas.line(ends, stroke.color, 2.0 * thin)
+
+
+def draw_arrow_head(canvas: Canvas, ends: FloatArray, before: float, thin: float, color: Any) -> None:
+    """The head of a one-way link, from the first of two points (2, 2) to the second, `before` pixels ahead of it."""
+    along = ends[1] - ends[0]
+    along = along / max(float(np.hypot(*along)), 1e-9)
+    tip, across = ends[1] - before * along, np.array([-along[1], along[0]])
+    back = tip - 9.0 * thin * along
+    canvas.polygon(np.array([tip, back + 4.0 * thin * across, back - 4.0 * thin * across]), color)
