@@ -138,6 +138,9 @@ def _frames(
     samples: Sequence[int],
     progress: Progress | None = None,
 ) -> Iterator[NDArray[np.uint8]]:
+    from khop_env.env.rendering import Scene
+
+    bounds = recording.states.bound
     for number, k in enumerate(samples):
         kinds = (kind for kind in (recording.states, recording.inputs) if isinstance(kind, ObserverRecord))
         largest = max(_largest_ratio(kind, k) for kind in kinds)
@@ -147,7 +150,7 @@ def _frames(
         if env is not None:
             world = dataclasses.replace(env.world, t=recording.time[[k]], x=x[:, None])
             decorate = functools.partial(env.task.draw, world=world)
-        yield renderer.frame(time, x, recording.states.estimate[k], largest, error, decorate)
+        yield renderer.frame(Scene(time, x, recording.states.estimate[k], bounds[k], largest, error, decorate))
         if progress is not None:
             progress((number + 1) / len(samples))
 

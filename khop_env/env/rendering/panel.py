@@ -21,12 +21,11 @@ from khop_env.env.rendering.looks import (
     mix,
 )
 from khop_env.env.rendering.scene import Scene
-from khop_env.network import PROFILES
-from khop_env.observers import FloatArray, Networked
+from khop_env.observers import FloatArray
 
 _GAUGE_END = 1.25  # the largest ratio that the gauge has room for
 _ROUNDING = 1.0 + 1e-6  # of errors over certified bounds, which they may reach
-_MOST_TYPES = 9
+_MOST_TYPES, _MOST_TYPES_WITH_LINKS = 9, 5  # that the legend has room for
 _STAR = np.array(
     [[r * math.sin(a), r * math.cos(a)] for a, r in zip(np.arange(10) * math.pi / 5, [1, 0.45] * 5, strict=True)]
 )
@@ -66,7 +65,7 @@ class Panel:
         observer: id and look of the agent whose estimates are drawn; None without estimates.
         error_label: name of the error beside the gauge.
         error_unit: its unit.
-        observers: that exchange messages; None for continuous exchange.
+        estimator: name of the one that estimates from messages; "" for continuous exchange.
     """
 
     def __init__(
@@ -80,12 +79,12 @@ class Panel:
         observer: tuple[str, Look] | None,
         error_label: str = "task error",
         error_unit: str = "m",
-        observers: Networked | None = None,
+        estimator: str = "",
     ) -> None:
         self._left, self._top, self._width, _ = rect
         self._unit, self._error_label, self._error_unit = unit, error_label, error_unit
         self._types, self._driven, self._task, self._observer = types, driven, task, observer
-        self._exchange = [] if observers is None else described(observers)
+        self._estimator = estimator
 
     def draw(self, canvas: Canvas, scene: Scene, hidden: int, ages: FloatArray | None = None) -> None:
         """Draw it.
@@ -101,8 +100,8 @@ class Panel:
         self._draw_gauge(canvas, scene)
         if scene.task_error is not None:
             self._write(canvas, f"{self._error_label}  {scene.task_error:#.3g} {self._error_unit}", advance=20)
-        for number, text in enumerate(self._exchange):
-            self._write(canvas, text, **({"advance": 18} if not number else {"size": 11, "color": SOFT, "advance": 15}))
+        if self._estimator:
+            self._write(canvas, f"estimator  {self._estimator}", advance=20)
         self._draw_legend(canvas, scene)
         if self._observer is not None:
             self._draw_estimates(canvas, self._observer, ages)
@@ -147,8 +146,9 @@ class Panel:
     def _draw_legend(self, canvas: Canvas, scene: Scene) -> None:
         unit, radius = self._unit, 7 * self._unit
         self._line += 12 * unit
+        most = _MOST_TYPES if scene.messages is None else _MOST_TYPES_WITH_LINKS
         for number, (text, look) in enumerate(self._types.items()):
-            if number == _MOST_TYPES:
+            if number == most:
                 self._write(canvas, f"and {len(self._types) - number} more types", indent=34)
                 break
             draw_agent(canvas, look, self._symbol(), 0.0, radius, star=False, ring=False)
@@ -167,7 +167,7 @@ class Panel:
             for missed, third in zip((1.0, 3.0, 8.0), range(3), strict=True):
                 draw_link(canvas, thirds[third : third + 2], faded(missed), unit)
             self._write(canvas, "link, messages lost", indent=34, advance=17)
-            self._note(canvas, "half a line: of the agent", "beside it, as receiver")
+            self._note(canvas, "half beside an agent:", "what it receives")
             self._line += 7 * unit
         if scene.up is not None:
             draw_link(canvas, self._symbol() + dash, DOWN, unit)
@@ -204,14 +204,10 @@ class Panel:
         return np.array([self._left + 13 * self._unit, self._line])
 
 
-def described(observers: Networked) -> list[str]:
-    """Network and estimator in a few short lines."""
-    profile = next((name for name, network in PROFILES.items() if network == observers.network), None)
-    network = f"network {profile}" if profile else "a network"
-    return [network, *observers.network.described().split(", "), f"estimator: {observers.estimator.name}"]
-
-
 def _ages(ages: FloatArray) -> list[str]:
+    """Mean and largest age of what is known, and the number of agents of which nothing is."""
     known = ages[np.isfinite(ages)]
     lines = [f"states {known.mean():.2f} s old in the", f"mean, the oldest {known.max():.2f} s"] if known.size else []
-    return lines if known.size == ages.size else [*lines, f"nothing yet of {ages.size - known.size} agents"]
+    if missing := ages.size - known.size:
+        lines.append(f"nothing yet of {missing} agent{'s' * (missing > 1)}")
+    return lines

@@ -18,6 +18,7 @@ from khop_env.env.rendering.on_map import OnMap
 from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import Scene
 from khop_env.env.rendering.trails import Trails
+from khop_env.network import PROFILES, Network
 from khop_env.observers import FloatArray, IntArray, Networked, ObserverDesign, Observers
 from khop_env.tasks import Task, World
 
@@ -98,8 +99,9 @@ class Renderer:
             observer=(fleet.ids[self.observer], self._look[self.observer]) if self._estimates.targets else None,
             error_label=error_label,
             error_unit=fleet.position_unit() if error_unit is None else error_unit,
-            observers=observers if isinstance(observers, Networked) else None,
+            estimator=observers.estimator.name if isinstance(observers, Networked) else "",
         )
+        self._network = described(observers.network) if isinstance(observers, Networked) else ""
         self._canvas: Canvas | None = None
         self._window: Window | None = None
         self._dismissed = False
@@ -245,7 +247,12 @@ class Renderer:
             canvas.text(label, middle, size, color=SOFT, anchor=(0.5, 0.5), upright=True)
         corners = np.array([[left, top], [left + width, top], [left + width, top + height], [left, top + height]])
         canvas.polygon(corners, "#BBBBBB", 1.0)
-        canvas.text(self._title, (left, top / 2), round(14 * self._unit), room=self._size[0] - 2 * left)
+        titled = round(14 * self._unit)
+        canvas.text(self._title, (left, top / 2), titled, room=self._size[0] - 2 * left)
+        if self._network:
+            right = self._size[0] - 16 * self._unit
+            room = right - left - canvas.measure(self._title, titled)[0] - 20 * self._unit
+            canvas.text(self._network, (right, top / 2), size, color=SOFT, anchor=(1.0, 0.5), room=room)
 
     def _draw_boxes(self, canvas: Canvas, estimated: FloatArray, half: FloatArray) -> int:
         """Draw the guaranteed boxes, and return the number of boxes whose edges are all out of view."""
@@ -304,3 +311,9 @@ class Renderer:
                 canvas.line(np.array([middle, middles[visible[number]]]), SOFT, 0.75)
             text = self._names[visible[number]]
             canvas.text(text, tuple(middle), size, anchor=(0.5, 0.5), halo=True)
+
+
+def described(network: Network) -> str:
+    """A network in a line, with its profile's name if it has one."""
+    name = next((f"network {name}: " for name, profile in PROFILES.items() if profile == network), "")
+    return name + network.described().replace("+-", "±")

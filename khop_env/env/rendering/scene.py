@@ -20,8 +20,8 @@ class Messages(NamedTuple):
 
     Attributes:
         age: (pairs,) of the newest state that each pair of the observers' layout has received, in s; inf for none.
-        missed: (L,) per link, in rounds, how much older its newest message is than the network's latency makes it; inf
-            where nothing has arrived.
+        missed: (L,) per link, in rounds, how much older its newest message is than one that comes on time; inf where
+            nothing has arrived.
     """
 
     age: FloatArray
@@ -60,8 +60,9 @@ class Scene(NamedTuple):
         up, messages = state.memory.get("up"), None
         if isinstance(observers, Networked):
             age = observers.information(state).age[:, 0]
-            newest, late = state.memory["channel.newest"][:, 0], observers.network.fewest_rounds_late
-            rounds = np.maximum(state.memory["channel.round"][0] - newest - late, 0)
+            network, newest = observers.network, state.memory["channel.newest"][:, 0]
+            on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
+            rounds = np.maximum(state.memory["channel.round"][0] - newest - on_time, 0)
             messages = Messages(age, np.where(newest < 0, np.inf, rounds))
         return Scene(
             t=float(simulator.t[0]),
