@@ -11,7 +11,7 @@ from khop_env.env.rendering import Messages, Renderer, Scene
 from khop_env.env.rendering.links import DOWN, FRESH, faded, stroke_of
 from khop_env.env.rendering.panel import _ages
 from khop_env.env.rendering.renderer import described
-from khop_env.network import Network
+from khop_env.network import Network, Outage
 from khop_env.observers import Networked
 from khop_env.scenarios import mixed_fleet, paper
 from khop_env.simulation import Simulator
@@ -140,6 +140,20 @@ class TestLinks:
         assert other.max() < 130
         scene = Scene(0.0, X, X, X, 0.5, up=np.array([True, False]))
         assert [stroke_of(scene, link) for link in (0, 1)] == [FRESH, DOWN]
+
+    @pytest.mark.parametrize("network", [None, "wifi"])
+    def test_links_follow_the_schedule(self, network):
+        whole = paper()
+        scenario = whole.replace(schedule=Outage(agent=0, start=0.25, duration=0.5))
+        simulator = scenario.build(observers=None if network is None else Networked(network, "relay"))
+        links = simulator.design.links
+        of_agent = (links.sender == 0) | (links.receiver == 0)
+        for t in (0.0, 0.5, 1.0):
+            if t:
+                simulator.step(0.5)
+            up = Scene.of(simulator).up
+            assert up.tolist() == [not (t == 0.5 and cut) for cut in of_agent]
+        assert Scene.of(whole.build()).up is None
 
     def test_an_arrow_fades_with_its_link(self):
         graph = nx.DiGraph([(0, 1), (1, 0), (1, 2)])

@@ -52,33 +52,31 @@ class LinkLines:
     def __init__(self, links: Links, radius: float, thin: float) -> None:
         self._radius, self._thin = radius, thin
         self.pairs = sorted({(min(pair), max(pair)) for pair in links.index})
-        self._ways = [(links.index.get((i, j)), links.index.get((j, i))) for i, j in self.pairs]
+        self._lines: list[tuple[list[int], int, int | None]] = []  # sender and receiver, the link, and the one back
+        for i, j in self.pairs:
+            sender, receiver = (i, j) if (i, j) in links.index else (j, i)
+            there, back = links.index[sender, receiver], links.index.get((receiver, sender))
+            self._lines.append(([sender, receiver], there, back))
 
     def draw(self, canvas: Canvas, middles: FloatArray, scene: Scene) -> None:
         """Draw them between agents at the pixels `middles` (N, 2); nan where an agent isn't drawn."""
         heads = []
-        for pair, (there, back) in zip(self.pairs, self._ways, strict=True):
-            ends = middles[list(pair)]
+        for agents, there, back in self._lines:
+            ends = middles[agents]
             if not np.isfinite(ends).all():
                 continue
-            if there is None or back is None:
-                ends = ends if back is None else ends[::-1]
-                stroke = stroke_of(scene, back if there is None else there)
-                self._line(canvas, ends, stroke)
+            stroke = stroke_of(scene, there)
+            other = stroke if back is None else stroke_of(scene, back)
+            if other == stroke:
+                draw_link(canvas, ends, stroke, self._thin)
+            else:
+                middle = ends.mean(axis=0)
+                draw_link(canvas, np.array([middle, ends[1]]), stroke, self._thin)
+                draw_link(canvas, np.array([middle, ends[0]]), other, self._thin)
+            if back is None:
                 heads.append((ends, stroke.color))
-                continue
-            strokes = stroke_of(scene, there), stroke_of(scene, back)
-            if strokes[0] == strokes[1]:
-                self._line(canvas, ends, strokes[0])
-                continue
-            middle = ends.mean(axis=0)
-            for stroke, receiver in zip(strokes, ends[::-1], strict=True):
-                self._line(canvas, np.array([middle, receiver]), stroke)
         for ends, color in heads:  # above all lines
             draw_arrow_head(canvas, ends, 1.6 * self._radius, self._thin, color)
-
-    def _line(self, canvas: Canvas, ends: FloatArray, stroke: Stroke) -> None:
-        draw_link(canvas, ends, stroke, self._thin)
 
 
 def stroke_of(scene: Scene, link: int) -> Stroke:

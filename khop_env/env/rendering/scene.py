@@ -57,7 +57,7 @@ class Scene(NamedTuple):
     def of(simulator: Simulator, task_error: float | None = None, decorate: Decorate | None = None) -> Scene:
         """The present state of a simulator's first environment, with the largest ratio of its `running_extremes`."""
         state, observers, extremes = simulator.state, simulator.observers, simulator.running_extremes
-        up, messages = state.memory.get("up"), None
+        up, messages = observers.links_up(state), None
         if isinstance(observers, Networked):
             age = observers.information(state).age[:, 0]
             network, newest = observers.network, state.memory["channel.newest"][:, 0]
@@ -73,5 +73,5 @@ class Scene(NamedTuple):
             task_error=task_error,
             decorate=decorate,
             messages=messages,
-            up=None if up is None else up[:, 0],
+            up=None if up is None else up[:, 0].copy(),
         )
