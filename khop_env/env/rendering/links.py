@@ -14,7 +14,7 @@ from khop_env.physics import Links
 
 _KEPT = 0.75  # of the colour, per round that a message is missing
 _FAINTEST = 0.15
-_DOWN = 0.45  # of the colour of a link that is down
+_DOWN = 0.6  # of the colour of a link that is down
 
 
 class Stroke(NamedTuple):
@@ -89,7 +89,7 @@ def stroke_of(scene: Scene, link: int) -> Stroke:
 def draw_link(canvas: Canvas, ends: FloatArray, stroke: Stroke, thin: float) -> None:
     """A line between two points (2, 2)."""
     if stroke.dashed:
-        canvas.dashes(ends[0], ends[1], stroke.color, 1.5 * thin, 3.0 * thin, 5.0 * thin)
+        canvas.dashes(ends[0], ends[1], stroke.color, 2.0 * thin, 3.0 * thin, 5.0 * thin)
     else:
         canvas.line(ends, stroke.color, 2.0 * thin)
 
