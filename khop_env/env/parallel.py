@@ -82,7 +82,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         if render_mode is not None:
             from khop_env.env.rendering import Renderer
 
-            self._renderer = Renderer.of(batched.task, batched.world, observers=batched.simulator.observers, title=name)
+            self._renderer = Renderer.of(batched.task, batched.world, batched.simulator.observers, title=name)
 
     def __repr__(self) -> str:
         return f"KHopEnv({self.batched})"

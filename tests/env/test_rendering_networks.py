@@ -27,9 +27,7 @@ def networked(scenario, network: str, estimator: str = "relay") -> Simulator:
 
 def drawn_on_a_path(missed=(0.0, 0.0, 0.0, 0.0), up=None, ages=(0.1,) * 6, graph=None, **changes):
     """Agents at 0, 3 and 6 m on a line; agent 0's estimates. Links: 1 -> 0, 0 -> 1, 2 -> 1, 1 -> 2."""
-    observers = Networked("ideal", "relay")
-    observers.layout = design(graph=graph).knowledge
-    layout = observers.layout
+    layout = design(graph=graph).knowledge
     scene = Scene(
         1.0,
         X,
@@ -39,7 +37,10 @@ def drawn_on_a_path(missed=(0.0, 0.0, 0.0, 0.0), up=None, ages=(0.1,) * 6, graph
         messages=Messages(np.array(ages), np.array(missed)),
         up=None if up is None else np.array(up),
     )
-    renderer = Renderer(design(graph=graph), np.zeros((0, 2), int), observers=observers, observer=0)
+    network = Network.of("wifi")
+    renderer = Renderer(
+        design(graph=graph), np.zeros((0, 2), int), layout=layout, network=network, estimator="relay", observer=0
+    )
     return renderer, renderer.frame(scene._replace(**changes))
 
 
@@ -57,7 +58,7 @@ class TestScene:
         simulator.step(1.0)
         scene, observers, fleet = Scene.of(simulator), simulator.observers, simulator.fleet
         certified = simulator.error_bounds().bound[:, 0]
-        renderer = Renderer(simulator.design, TASK, observers=observers, observer=0)
+        renderer = Renderer(simulator.design, TASK, layout=observers.layout, observer=0)
         targets = renderer._estimates.targets
         assert set(targets) > set(simulator.design.communication[0])
         half = renderer._estimates.half_widths(scene.bounds)
@@ -101,7 +102,7 @@ class TestScene:
         scene = Scene.of(simulator, 1.5)
         assert scene.ratio == simulator.extremes.relative[0] > 0.1
         assert scene.task_error == 1.5
-        renderer = Renderer(simulator.design, TASK, observers=simulator.observers)
+        renderer = Renderer(simulator.design, TASK, layout=simulator.observers.layout)
         layout, age = simulator.observers.layout, simulator.observers.information(simulator.state).age[:, 0]
         pairs = zip(layout.observer.tolist(), layout.pair_target.tolist(), strict=True)
         own = {i: age[pair] for pair, (a, i) in enumerate(pairs) if a == renderer.observer}
@@ -114,7 +115,7 @@ class TestScene:
         assert scene.up is None
         assert scene.ratio == simulator.extremes.kept()[0]
         ideal = Renderer(simulator.design, TASK).frame(scene)
-        assert np.array_equal(ideal, Renderer(simulator.design, TASK, observers=simulator.observers).frame(scene))
+        assert np.array_equal(ideal, Renderer(simulator.design, TASK, layout=simulator.observers.layout).frame(scene))
 
 
 class TestLinks:

@@ -19,7 +19,7 @@ from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import Scene
 from khop_env.env.rendering.trails import Trails
 from khop_env.network import PROFILES, Network
-from khop_env.observers import FloatArray, IntArray, Networked, ObserverDesign, Observers
+from khop_env.observers import FloatArray, IntArray, Networked, ObserverDesign, Observers, PairLayout
 from khop_env.tasks import Task, World
 
 _MOST_LABELS = 40  # in larger fleets only the observer and its targets are labelled
@@ -37,7 +37,9 @@ class Renderer:
     Args:
         design: the observers, with the fleet and the communication graph.
         task_edges: (E, 2) directed pairs (i, j): agent i acts on j.
-        observers: of the simulator, for the layout of the estimates and the network; by default those of the design.
+        layout: of the estimates; that of the design's observers by default.
+        network: over which agents exchange messages; None for continuous exchange.
+        estimator: its name, under a network.
         driven: indices of the agents that don't act, marked with a star.
         driven_label: their name in the legend.
         observer: index of the agent whose estimates are drawn; by default the agent with most task edges to k-hop
@@ -59,7 +61,9 @@ class Renderer:
         design: ObserverDesign,
         task_edges: IntArray,
         *,
-        observers: Observers | None = None,
+        layout: PairLayout | None = None,
+        network: Network | None = None,
+        estimator: str = "",
         driven: Sequence[int] = (),
         driven_label: str = "driven agent",
         observer: int | None = None,
@@ -72,7 +76,7 @@ class Renderer:
         self._fleet, self._title, self._size = fleet, title, size
         self._driven = frozenset(fleet.agent(agent) for agent in driven)
         self.observer = default_observer(design, task_edges) if observer is None else fleet.agent(observer)
-        self._estimates = Estimates(design, self.observer, None if observers is None else observers.layout)
+        self._estimates = Estimates(design, self.observer, layout)
         self._tasks = undirected(task_edges)
         self._headings = headings(fleet)
         self._looks = looks(fleet.models)
@@ -99,27 +103,31 @@ class Renderer:
             observer=(fleet.ids[self.observer], self._look[self.observer]) if self._estimates.targets else None,
             error_label=error_label,
             error_unit=fleet.position_unit() if error_unit is None else error_unit,
-            estimator=observers.estimator.name if isinstance(observers, Networked) else "",
+            estimator=estimator,
         )
-        self._network = described(observers.network) if isinstance(observers, Networked) else ""
+        self._network = "" if network is None else described(network)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
         self._dismissed = False
         self.restart()
 
     @classmethod
-    def of(cls, task: Task, world: World, **arguments: Any) -> Renderer:
+    def of(cls, task: Task, world: World, observers: Observers, **arguments: Any) -> Renderer:
         """A renderer of a task's fleet: its edges, and the agents that don't act.
 
         Args:
             task: bound to the fleet.
             world: of the task.
+            observers: of its simulator.
             arguments: other arguments of the renderer.
         """
         acting = set(task.acting(world))
         driven = [i for i in range(len(world.fleet)) if i not in acting]
         label, unit = task.driven_label, task.error_unit(world)
-        return cls(world.design, task.edges, driven=driven, driven_label=label, error_unit=unit, **arguments)
+        arguments |= {"driven": driven, "driven_label": label, "error_unit": unit, "layout": observers.layout}
+        if isinstance(observers, Networked):
+            arguments |= {"network": observers.network, "estimator": observers.estimator.name}
+        return cls(world.design, task.edges, **arguments)
 
     def restart(self) -> None:
         """Begin a new episode: clear the trails, the view and the places of labels."""

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.observers import FloatArray, Networked
+from khop_env.observers import FloatArray
+from khop_env.observers.networked import missed_rounds
 from khop_env.simulation import Simulator
 from khop_env.tasks import MapCanvas
 
@@ -20,7 +21,7 @@ class Messages(NamedTuple):
 
     Attributes:
         age: (pairs,) of the newest state that each pair of the observers' layout has received, in s; inf for none.
-        missed: (L,) per link, in rounds, how much older its newest message is than one that comes on time; inf where
+        missed: (L,) rounds by which the newest message over each link is older than one that comes on time; inf where
             nothing has arrived.
     """
 
@@ -58,12 +59,8 @@ class Scene(NamedTuple):
         """The present state of a simulator's first environment, with the largest ratio of its `running_extremes`."""
         state, observers, extremes = simulator.state, simulator.observers, simulator.running_extremes
         up, messages = observers.links_up(state), None
-        if isinstance(observers, Networked):
-            age = observers.information(state).age[:, 0]
-            network, newest = observers.network, state.memory["channel.newest"][:, 0]
-            on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
-            rounds = np.maximum(state.memory["channel.round"][0] - newest - on_time, 0)
-            messages = Messages(age, np.where(newest < 0, np.inf, rounds))
+        if observers.by_messages:
+            messages = Messages(observers.information(state).age[:, 0], missed_rounds(observers, state)[:, 0])
         return Scene(
             t=float(simulator.t[0]),
             x=simulator.x[0],
