@@ -13,7 +13,7 @@ from khop_env.observers import FloatArray
 from khop_env.physics import Links
 
 _KEPT = 0.75  # of the colour, per round that a message is missing
-_FAINTEST = 0.15
+_FAINTEST = 0.25  # darker than the lines of the grid
 _DOWN = 0.6  # of the colour of a link that is down
 
 
