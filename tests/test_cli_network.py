@@ -161,7 +161,6 @@ class TestRun:
             (("paper", "--network", "wify"), "no network 'wify'; did you mean 'wifi'?"),
             (("paper", "--network", "wifi", "--order", "2"), "--order: over a network estimates follow from rounds of"),
             (("paper", "--network", "wifi", "--integrator", "explicit"), "--integrator: over a network estimates"),
-            (("paper", "--network", "wifi", "--video", "film.gif"), "a run over a network can't be filmed"),
             (
                 ("consensus_v0", "--network", "wifi", "--env", "network=lossy"),
                 "--env network and --network: choose one of them",

@@ -33,7 +33,6 @@ from khop_env.terminal import Progress, say, waiting
 
 if TYPE_CHECKING:
     from agents.running import PolicyRun
-    from khop_env.observers import Observers
     from khop_env.results import Recording
     from khop_env.scenarios import Scenario
 
@@ -126,7 +125,7 @@ def run(
             episode = continuous(chosen, controller, observe.value, duration, steps, seed, over)
         played = episode.played
         configuration = configuration_of(chosen, episode, observe.value, seed)
-        film = _film(video, observer, chosen, episode.observers)
+        film = _film(video, observer, chosen)
         parts = [chosen.name, episode.controller, observe.value, "explicit" * (episode.observers.name == "explicit")]
         if played is not None:
             parts.insert(0, played.env.batched.task.environment)
@@ -175,7 +174,7 @@ def run(
         raise typer.Exit(1)
 
 
-def _film(video: Path | None, observer: str | None, scenario: Scenario, observers: Observers) -> int | None:
+def _film(video: Path | None, observer: str | None, scenario: Scenario) -> int | None:
     """Refuse a film that couldn't be made before there is something to lose; the number of the agent to show, if any.
 
     Raises:
@@ -190,8 +189,6 @@ def _film(video: Path | None, observer: str | None, scenario: Scenario, observer
     from khop_env.results.video import require_video
 
     require_video(video)
-    if observers.by_messages:
-        raise ValueError("--video: frames show continuous exchange; a run over a network can't be filmed")
     shown = None if observer is None else scenario.fleet.agent(int(observer) if observer.isdecimal() else observer)
     video.parent.mkdir(parents=True, exist_ok=True)
     return shown

@@ -82,7 +82,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         if render_mode is not None:
             from khop_env.env.rendering import Renderer
 
-            self._renderer = Renderer.of(batched.task, batched.world, title=name)
+            self._renderer = Renderer.of(batched.task, batched.world, batched.simulator.observers, title=name)
 
     def __repr__(self) -> str:
         return f"KHopEnv({self.batched})"
@@ -253,13 +253,14 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         self._renderer.remember(float(self.batched.simulator.t[0]), self.batched.simulator.x[0])
 
     def _draw(self, renderer: Renderer) -> NDArray[np.uint8] | None:
-        batched, simulator = self.batched, self.batched.simulator
-        largest, task_error = float(simulator.extremes.kept()[0]), float(batched.task_errors().mean())
-        scene = (float(simulator.t[0]), simulator.x[0], simulator.estimates[0], largest, task_error)
+        from khop_env.env.rendering import Scene
+
+        batched = self.batched
         decorate = functools.partial(batched.task.draw, world=batched.world)
+        scene = Scene.of(batched.simulator, float(batched.task_errors().mean()), decorate)
         if self.render_mode == "rgb_array":
-            return renderer.frame(*scene, decorate=decorate)
-        renderer.show(*scene, decorate=decorate)
+            return renderer.frame(scene)
+        renderer.show(scene)
         return None
 
 

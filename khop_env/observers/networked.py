@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.network import Channel, Network
-from khop_env.observers.base import Assumptions, Certified, Extremes, Information, Memory, Plant, PlantState
+from khop_env.observers.base import Assumptions, Certified, Extremes, Information, Memory, Observers, Plant, PlantState
 from khop_env.observers.certificate import Certificate
 from khop_env.observers.certified import report
 from khop_env.observers.design import ObserverDesign
@@ -288,6 +288,19 @@ def as_estimator(estimator: str | Estimator) -> Estimator:
             f"{missing[0]}"
         )
     return copy.copy(estimator)
+
+
+def missed_rounds(observers: Observers, state: PlantState) -> FloatArray:
+    """(L, B) rounds by which the newest message over each link is older than one that comes on time.
+
+    It is inf where nothing has arrived, and 0 for observers without rounds.
+    """
+    if not isinstance(observers, Networked):
+        return np.zeros((len(observers.layout.links), len(state.t)))
+    network, newest = observers.network, state.memory[_CHANNEL + "newest"]
+    on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
+    missed = state.memory[_CHANNEL + "round"] - newest - on_time
+    return np.where(newest < 0, math.inf, np.maximum(missed, 0))
 
 
 def _certificates(design: ObserverDesign, assumed: Assumptions, noise: float) -> list[Certificate]:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from khop_env.observers import Extremes, FloatArray, FunnelError, ObserverDesign, SolveError
+from khop_env.observers import Extremes, FloatArray, FunnelError, Networked, ObserverDesign, SolveError
+from khop_env.observers.networked import missed_rounds
 from khop_env.physics import Fleet
 from khop_env.results.records import MessageRecord, ObserverRecord
 from khop_env.scenarios.scenario import number_of_steps
@@ -161,10 +162,14 @@ class _Samples:
             "g": lambda: simulator.g[0],
             "estimate": lambda: simulator.estimates[0],
         }
-        if simulator.observers.by_messages:
+        observers = simulator.observers
+        if observers.links_up(simulator.state) is not None:
+            self._sources["up"] = lambda: np.asarray(observers.links_up(simulator.state), float)[:, 0]
+        if observers.by_messages:
             self._sources |= {
                 "bound": lambda: simulator.error_bounds().bound[:, 0],
-                "age": lambda: simulator.observers.information(simulator.state).age[:, 0],
+                "age": lambda: observers.information(simulator.state).age[:, 0],
+                "missed": lambda: missed_rounds(observers, simulator.state)[:, 0],
             }
         else:
             self._sources |= {
@@ -186,17 +191,30 @@ class _Samples:
         design = self._simulator.design
         kept = {name: values[: self._taken] for name, values in self._arrays.items()}
         time = kept["time"][:, 0]
+        up = kept["up"].astype(bool) if "up" in kept else None
         states: ObserverRecord | MessageRecord
         if "age" in kept:
-            layout = self._simulator.observers.layout
-            states, inputs = (
-                MessageRecord(layout, time, *(kept[key] for key in ("x", "estimate", "bound", "age"))),
-                None,
+            observers = self._simulator.observers
+            network, estimator = None, observers.name
+            if isinstance(observers, Networked):
+                network, estimator = observers.network, observers.estimator.name
+            states = MessageRecord(
+                layout=observers.layout,
+                time=time,
+                truth=kept["x"],
+                estimate=kept["estimate"],
+                bound=kept["bound"],
+                age=kept["age"],
+                missed=kept["missed"],
+                network=network,
+                estimator=estimator,
+                up=up,
             )
+            inputs = None
         else:
-            states = ObserverRecord(design.states, time, kept["x"], kept["estimate"], kept["disagreement"])
+            states = ObserverRecord(design.states, time, kept["x"], kept["estimate"], kept["disagreement"], up)
             estimates = kept["input_estimate"], kept["input_disagreement"]
-            inputs = ObserverRecord(design.inputs, time, kept["g"], *estimates)
+            inputs = ObserverRecord(design.inputs, time, kept["g"], *estimates, up)
         return Recording(
             design=design,
             x=kept["x"],

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from khop_env.brief import brief
+from khop_env.network import Network
 from khop_env.observers import FloatArray, FunnelBank, Funnels, PairLayout
+from khop_env.observers.weights import WeightsNow
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +23,7 @@ class ObserverRecord:
         truth: (T, n) true values: the fleet's x, or its g.
         estimate: (T, P) estimates.
         disagreement: (T, P) xi, or mu.
+        up: (T, L) whether each link was up; None where all were, always.
     """
 
     funnels: Funnels
@@ -27,6 +31,7 @@ class ObserverRecord:
     truth: FloatArray
     estimate: FloatArray
     disagreement: FloatArray
+    up: NDArray[np.bool_] | None = None
 
     __repr__ = brief
 
@@ -58,7 +63,13 @@ class ObserverRecord:
 
     @property
     def bound(self) -> FloatArray:
-        """(T, P) each observer's own guaranteed bound on the error; at most delta, or theta."""
+        """(T, P) each observer's own guaranteed bound on the error; at most delta, or theta, while all links are up.
+
+        It is inf for observers that are cut off from their target.
+        """
+        if self.up is not None:
+            sums = WeightsNow(self.layout, len(self.time)).inverse_row_sums(np.ascontiguousarray(self.up.T))
+            return self.rho * sums[self.layout.column_pair].T
         out = np.empty((self.layout.size, len(self.time)))
         return self.funnels.error_bounds(self._rows(self.funnels.delta), out).T
 
@@ -80,6 +91,10 @@ class MessageRecord:
         estimate: (T, P) estimates.
         bound: (T, P) certified bounds on their errors; inf where nothing is certified.
         age: (T, pairs) time since the newest state that has arrived was measured, in s; inf where none has.
+        missed: (T, L) rounds by which the newest message over each link is older than one that comes on time.
+        network: over which messages are exchanged.
+        estimator: its name.
+        up: (T, L) whether each link was up; None where all were, always.
     """
 
     layout: PairLayout
@@ -88,6 +103,10 @@ class MessageRecord:
     estimate: FloatArray
     bound: FloatArray
     age: FloatArray
+    missed: FloatArray
+    network: Network | None
+    estimator: str
+    up: NDArray[np.bool_] | None = None
 
     __repr__ = brief
 

@@ -85,13 +85,11 @@ def write_video(
         The path.
 
     Raises:
-        ValueError: if suffix, observer, fps or speed is invalid, or the run had a network.
+        ValueError: if suffix, observer, fps or speed is invalid.
         ModuleNotFoundError: if a package is missing; the message says what to install.
         OSError: if the file can't be written; no partial file is left.
     """
     require_video(path)
-    if isinstance(recording.states, MessageRecord):
-        raise ValueError("a run over a network can't be filmed: frames show continuous exchange")
     from khop_env.env.rendering import Renderer
 
     path = Path(path)
@@ -101,12 +99,21 @@ def write_video(
     size = SIZES[path.suffix.lower()]
     if env is None:
         edges = directed(scenario.task)
+        over = recording.states if isinstance(recording.states, MessageRecord) else None
         renderer = Renderer(
-            recording.design, edges, observer=index, title=scenario.name, error_label="consensus error", size=size
+            recording.design,
+            edges,
+            layout=recording.states.layout,
+            network=None if over is None else over.network,
+            estimator="" if over is None else over.estimator,
+            observer=index,
+            title=scenario.name,
+            error_label="consensus error",
+            size=size,
         )
     else:
         title = f"{env.task.name} on {scenario.name}"
-        renderer = Renderer.of(env.task, env.world, observer=index, title=title, size=size)
+        renderer = Renderer.of(env.task, env.world, env.simulator.observers, observer=index, title=title, size=size)
     samples = _samples(recording, fps / speed)
     frames = _frames(renderer, recording, env, samples, progress)
     try:
@@ -138,16 +145,25 @@ def _frames(
     samples: Sequence[int],
     progress: Progress | None = None,
 ) -> Iterator[NDArray[np.uint8]]:
+    from khop_env.env.rendering import Messages, Scene
+
+    states = recording.states
+    bounds = states.bound
     for number, k in enumerate(samples):
-        kinds = (kind for kind in (recording.states, recording.inputs) if isinstance(kind, ObserverRecord))
-        largest = max(_largest_ratio(kind, k) for kind in kinds)
         time, x, errors = float(recording.time[k]), recording.x[k], recording.task_error
         error = float(consensus_error(recording.fleet, x)) if errors is None else float(errors[k])
         decorate = None
         if env is not None:
             world = dataclasses.replace(env.world, t=recording.time[[k]], x=x[:, None])
             decorate = functools.partial(env.task.draw, world=world)
-        yield renderer.frame(time, x, recording.states.estimate[k], largest, error, decorate)
+        if isinstance(states, MessageRecord):
+            messages, largest = Messages(states.age[k], states.missed[k]), _largest_share(states, k)
+        else:
+            kinds = (kind for kind in (states, recording.inputs) if isinstance(kind, ObserverRecord))
+            messages, largest = None, max(_largest_ratio(kind, k) for kind in kinds)
+        up = None if states.up is None else states.up[k]
+        scene = Scene(time, x, states.estimate[k], bounds[k], largest, error, decorate, messages, up)
+        yield renderer.frame(scene)
         if progress is not None:
             progress((number + 1) / len(samples))
 
@@ -157,6 +173,13 @@ def _largest_ratio(kind: ObserverRecord, sample: int) -> float:
     layout = kind.funnels.layout
     funnels = kind.funnels.rho.evaluate(kind.time[[sample]], np.empty((layout.rows, 1)))
     return float(np.max(np.abs(kind.disagreement[sample]) / funnels[layout.column_row, 0], initial=0.0))
+
+
+def _largest_share(record: MessageRecord, sample: int) -> float:
+    """Largest error over its certified bound in one sample; 0 where nothing is certified."""
+    truth, bound = record.truth[sample, record.layout.column_source], record.bound[sample]
+    error = np.abs(record.estimate[sample] - truth)
+    return float(np.max(np.divide(error, bound, out=np.where(error > 0.0, np.inf, 0.0), where=bound > 0.0)))
 
 
 def _write_mp4(path: Path, frames: Iterator[NDArray[np.uint8]], fps: int) -> None:

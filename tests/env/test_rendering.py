@@ -9,19 +9,11 @@ import numpy as np
 import pytest
 
 from khop_env.env.rendering import Renderer, canvas
-from khop_env.env.rendering.scene import (
-    ALARM_COLOR,
-    COLORS,
-    EDGE_COLOR,
-    TASK_COLOR,
-    Estimates,
-    default_observer,
-    looks,
-    short_names,
-)
+from khop_env.env.rendering.estimates import Estimates, default_observer
+from khop_env.env.rendering.looks import ALARM_COLOR, COLORS, EDGE_COLOR, TASK_COLOR, looks, short_names
 from khop_env.observers import Exponential, ObserverDesign
 from khop_env.physics import DoubleIntegrator, DriftingIntegrator, Fleet, SingleIntegrator, SurfaceVessel, Unicycle
-from tests.env.drawing import DELTA, TASK, design, renderer, scene
+from tests.env.drawing import DELTA, TASK, design, renderer, scene, scene_of
 from tests.strategies import definition_of_m
 
 
@@ -45,9 +37,9 @@ def near(color, other, tolerance=40) -> bool:
 class TestFrame:
     def test_is_a_fresh_picture(self):
         drawn = renderer(size=(640, 480))
-        first = drawn.frame(*scene())
+        first = drawn.frame(scene())
         kept = first.copy()
-        second = drawn.frame(*scene(1.0, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0)))
+        second = drawn.frame(scene(1.0, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0)))
         assert first.shape == (480, 640, 3)
         assert first.dtype == np.uint8
         assert first.flags.writeable
@@ -57,15 +49,15 @@ class TestFrame:
         assert not np.array_equal(first, second)
 
     def test_same_scene_same_picture(self):
-        assert np.array_equal(renderer().frame(*scene()), renderer().frame(*scene()))
+        assert np.array_equal(renderer().frame(scene()), renderer().frame(scene()))
 
     def test_agents_are_where_they_are(self):
         drawn = renderer()
-        first = drawn.frame(*scene(0.0))
+        first = drawn.frame(scene(0.0))
         for place in ((0, 0), (3, 1), (1, -2)):
             assert near(at(drawn, first, place), BLUE)
         assert not near(at(drawn, first, (2, 0)), BLUE)
-        moved = drawn.frame(*scene(5.0, x=(2.0, 0.0, 3.0, 1.0, 1.0, -2.0)))
+        moved = drawn.frame(scene(5.0, x=(2.0, 0.0, 3.0, 1.0, 1.0, -2.0)))
         assert near(at(drawn, moved, (2, 0)), BLUE)
         assert not near(at(drawn, moved, (0, 0)), BLUE)
 
@@ -74,8 +66,7 @@ class TestFrame:
         """On the path 0, 1, 2 from left to right, of which the first link goes both ways."""
         graph = nx.DiGraph([(0, 1), (1, 0), link])
         drawn = Renderer(design(graph=graph), np.zeros((0, 2), int))
-        estimates = np.zeros(design(graph=graph).states.layout.size)
-        frame = drawn.frame(0.0, np.array([0.0, 0.0, 3.0, 0.0, 6.0, 0.0]), estimates, 0.5)
+        frame = drawn.frame(scene_of(design(graph=graph), 0.0, np.array([0.0, 0.0, 3.0, 0.0, 6.0, 0.0])))
         for agent, marked in ((1, False), (2, link == (1, 2))):
             x, y = drawn._camera.pixels(np.array([3.0 * agent, 0.0])).round().astype(int)
             beside = frame[[y - 2, y + 2], round(x - 1.6 * drawn._radius - 7.0), 0]  # of the line to the left
@@ -85,14 +76,14 @@ class TestFrame:
 
     def test_north_is_up(self):
         drawn = renderer()
-        drawn.frame(*scene())
+        drawn.frame(scene())
         assert drawn._camera.pixels(np.array([0.0, 1.0]))[1] < drawn._camera.pixels(np.array([0.0, 0.0]))[1]
 
     @pytest.mark.parametrize("t", [0.8, 1.0, 9.0])
     def test_boxes_are_as_wide_as_the_bound(self, t):
         """Agent 0's estimate of agent 2 is 0.2 m off; the bound's edges are delta(t) from the estimate: eta = 1."""
         drawn = renderer(observer=0)
-        frame = drawn.frame(*scene(t, offset=0.2))
+        frame = drawn.frame(scene(t, offset=0.2))
         estimated, delta = np.array([1.2, -1.8]), DELTA(t)
         steps = np.arange(-8, 9)  # pixels across the edge
         for side in ((-1.0, -0.5), (1.0, -0.5), (0.0, -1.0), (0.0, 1.0)):  # where nothing else is drawn
@@ -105,30 +96,30 @@ class TestFrame:
 
     def test_boxes_larger_than_the_view_are_counted(self):
         drawn = renderer(observer=0)
-        drawn.frame(*scene(0.0))
+        drawn.frame(scene(0.0))
         estimated = np.array([[1.0, -2.0]])
-        assert drawn._draw_boxes(drawn._canvas, 0.0, estimated) == 1
-        assert drawn._draw_boxes(drawn._canvas, 9.0, estimated) == 0
+        for t, hidden in ((0.0, 1), (9.0, 0)):
+            assert drawn._draw_boxes(drawn._canvas, estimated, np.full((1, 2), DELTA(t))) == hidden
 
     def test_an_estimate_is_drawn_as_a_hollow_marker(self):
         drawn = renderer(observer=0)
-        apart = drawn.frame(*scene(1.0, offset=0.4))
+        apart = drawn.frame(scene(1.0, offset=0.4))
         radius = 1.55 * drawn._radius * drawn._camera.meters
         assert near(at(drawn, apart, (1.4 + radius, -1.6)), BLUE, 60)
         assert not near(at(drawn, apart, (1.4, -1.6 + 0.5 * radius)), BLUE, 60)  # hollow
 
     def test_trails_end_with_the_episode(self):
         drawn = renderer()
-        first = drawn.frame(*scene(0.0))
+        first = drawn.frame(scene(0.0))
         for t in (0.5, 1.0, 1.5):
-            later = drawn.frame(*scene(t, x=(t, t, 3.0, 1.0, 1.0, -2.0)))
+            later = drawn.frame(scene(t, x=(t, t, 3.0, 1.0, 1.0, -2.0)))
         assert at(drawn, later, (1.2, 1.2))[0] < 225  # the trail: darker than white and the grid
         assert at(drawn, first, (1.2, 1.2))[0] > 225
-        assert np.array_equal(drawn.frame(*scene(0.0)), first)
+        assert np.array_equal(drawn.frame(scene(0.0)), first)
 
     def test_the_guarantee_broken_is_alarming(self):
-        def alarmed(normalized):
-            frame = renderer().frame(*scene(normalized=normalized))
+        def alarmed(ratio):
+            frame = renderer().frame(scene(ratio=ratio))
             return int((np.abs(frame.astype(int) - rgb(ALARM_COLOR)).max(axis=2) < 5).sum())
 
         assert alarmed(0.99) == 0
@@ -140,10 +131,10 @@ class TestFrame:
     def test_states_that_ran_away_leave_the_others_in_view(self, value):
         drawn = renderer()
         with np.errstate(all="raise"):
-            frame = drawn.frame(*scene(0.0, x=(value, 0.0, 3.0, 1.0, 1.0, -2.0), normalized=np.nan))
-            drawn.frame(*scene(1.0, x=(value,) * 6))
+            frame = drawn.frame(scene(0.0, x=(value, 0.0, 3.0, 1.0, 1.0, -2.0), ratio=np.nan))
+            drawn.frame(scene(1.0, x=(value,) * 6))
         drawn = renderer()
-        frame = drawn.frame(*scene(0.0, x=(value, 0.0, 3.0, 1.0, 1.0, -2.0)))
+        frame = drawn.frame(scene(0.0, x=(value, 0.0, 3.0, 1.0, 1.0, -2.0)))
         assert near(at(drawn, frame, (3, 1)), BLUE)
 
     @pytest.mark.parametrize("dim", [1, 3])
@@ -152,15 +143,15 @@ class TestFrame:
         drawn = Renderer(fleet, TASK, driven=[1])
         x = np.zeros(3 * dim)
         x[dim] = 1.0
-        frame = drawn.frame(2.0, x, x[fleet.states.layout.column_source], 0.1)
+        frame = drawn.frame(scene_of(fleet, 2.0, x))
         column, middle = drawn._camera.pixels(np.zeros(2)).round().astype(int)
         for row in drawn._rows.round().astype(int)[[0, 2]] if dim == 1 else [middle]:
             assert near(frame[row, column], BLUE)
         assert drawn._camera.pixels(np.array([1.0, 0.0]))[0] > column + 100
 
     def test_without_anyone_to_estimate(self):
-        alone = Renderer(design(graph=nx.complete_graph(3)), TASK)
-        assert alone.frame(0.0, np.arange(6.0), np.zeros(0), 0.0).shape == (720, 900, 3)
+        complete = design(graph=nx.complete_graph(3))
+        assert Renderer(complete, TASK).frame(scene_of(complete, 0.0, np.arange(6.0))).shape == (720, 900, 3)
 
 
 class TestWhoIsShown:
@@ -179,6 +170,7 @@ class TestWhoIsShown:
         }
         mixed = ObserverDesign(fleet, nx.path_graph(5), 4, bounds, Exponential(5.0, 1.0, 5.0))
         estimates = np.random.default_rng(0).normal(size=mixed.states.layout.size)
+        bounds_at_2 = scene_of(mixed, 2.0, np.zeros(fleet.n)).bounds
         for observer in range(5):
             drawn = Estimates(mixed, observer)
             assert tuple(drawn.targets) == mixed.neighborhoods[observer]
@@ -192,9 +184,9 @@ class TestWhoIsShown:
                 share = np.linalg.eigvalsh(m)[0] / np.sqrt(len(m)) * np.linalg.inv(m).sum(axis=1)
                 own = share[members.index(observer)]
                 expected = [own * float(bounds[j][c](2.0)) for c in (0, 1)]
-                assert drawn.half_widths(2.0)[number] == pytest.approx(expected, rel=1e-12)
+                assert drawn.half_widths(bounds_at_2)[number] == pytest.approx(expected, rel=1e-12)
                 expected = [own * bounds[j][c].final for c in (0, 1)]
-                assert drawn.final_half_widths()[number] == pytest.approx(expected, rel=1e-12)
+                assert drawn.half_widths_in_view(bounds_at_2)[number] == pytest.approx(expected, rel=1e-12)
 
     def test_no_such_agent(self):
         with pytest.raises(ValueError, match="no agent 7"):
@@ -233,10 +225,10 @@ class TestAsAnObject:
     @pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
     def test_copies_go_on_alike(self, copied):
         drawn = renderer(title="two of them")
-        drawn.frame(*scene(0.0))
+        drawn.frame(scene(0.0))
         other = copied(drawn)
         following = scene(0.5, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0))
-        assert np.array_equal(drawn.frame(*following), other.frame(*following))
+        assert np.array_equal(drawn.frame(following), other.frame(following))
 
     def test_without_pygame_it_says_what_to_install(self, monkeypatch):
         canvas.load_pygame.cache_clear()
@@ -244,17 +236,17 @@ class TestAsAnObject:
         drawn = renderer()
         for draw in (drawn.frame, drawn.show):
             with pytest.raises(ModuleNotFoundError, match=r"pip install -c constraints.txt -e '\.\[render\]'"):
-                draw(*scene())
+                draw(scene())
 
     @pytest.mark.parametrize("again", [False, True])
     def test_pygame_ended_by_others_is_no_end(self, again):
         """pygame.quit() makes all fonts invalid for good, also after pygame.init()."""
         pygame, drawn = canvas.load_pygame(), renderer()
-        drawn.frame(*scene())
+        drawn.frame(scene())
         pygame.quit()
         if again:
             pygame.font.init()
         expected = renderer()
-        expected.frame(*scene())
+        expected.frame(scene())
         later = scene(0.1, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0))
-        assert np.array_equal(drawn.frame(*later), expected.frame(*later))
+        assert np.array_equal(drawn.frame(later), expected.frame(later))

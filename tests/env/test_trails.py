@@ -72,7 +72,7 @@ def test_seldom_rendered_paths_are_whole():
         view.step(np.full(16, 0.5))
     frames = seldom.render(), view.render()
     assert np.array_equal(*frames)
-    trails = [env._renderer._trail for env in (often, seldom)]
+    trails = [env._renderer._trails.points for env in (often, seldom)]
     assert [len(trail) for trail in trails] == [16, 16]
     for (t, positions), (other_t, other_positions) in zip(*trails, strict=True):
         assert t == other_t

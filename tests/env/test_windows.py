@@ -25,13 +25,13 @@ def pixels(drawn):
 
 def test_shows_the_frame():
     drawn = renderer()
-    drawn.show(*scene())
-    assert np.array_equal(pixels(drawn), renderer().frame(*scene()))
+    drawn.show(scene())
+    assert np.array_equal(pixels(drawn), renderer().frame(scene()))
     assert pickle.loads(pickle.dumps(drawn))._window is None  # one can't be copied
     drawn.close()
     drawn.close()
     assert drawn._window is None
-    drawn.show(*scene())  # opens again
+    drawn.show(scene())  # opens again
     drawn.close()
 
 
@@ -39,13 +39,13 @@ def test_shows_the_frame():
 def test_closed_by_hand_it_stays_closed(kind):
     pygame = canvas.load_pygame()
     drawn = renderer()
-    drawn.show(*scene())
+    drawn.show(scene())
     event = {"window": drawn._window._window} if kind == "WINDOWCLOSE" else {}
     pygame.event.post(pygame.event.Event(getattr(pygame, kind), event))
     for t in (0.1, 0.2):
-        drawn.show(*scene(t))
+        drawn.show(scene(t))
         assert drawn._window is None
-    assert drawn.frame(*scene(0.3)).shape == (720, 900, 3)
+    assert drawn.frame(scene(0.3)).shape == (720, 900, 3)
     drawn.close()
 
 
@@ -54,22 +54,22 @@ def test_two_windows_live_together():
     pygame = canvas.load_pygame()
     first, second, third = renderer(), renderer(size=(640, 480)), renderer()
     moved = scene(0.1, x=(0.5, 0.5, 3.0, 1.0, 1.0, -2.0))
-    first.show(*scene())
+    first.show(scene())
     for drawn in (second, third):
-        drawn.show(*moved)
-    assert np.array_equal(pixels(first), renderer().frame(*scene()))
-    assert np.array_equal(pixels(second), renderer(size=(640, 480)).frame(*moved))
+        drawn.show(moved)
+    assert np.array_equal(pixels(first), renderer().frame(scene()))
+    assert np.array_equal(pixels(second), renderer(size=(640, 480)).frame(moved))
     third.close()
     pygame.event.post(pygame.event.Event(pygame.WINDOWCLOSE, window=first._window._window))
-    second.show(*scene(0.2))
+    second.show(scene(0.2))
     assert second._window is not None  # although it was the one that read the event
-    first.show(*scene(0.2))
+    first.show(scene(0.2))
     assert first._window is None
-    second.show(*scene(0.3))
+    second.show(scene(0.3))
     pygame.event.post(pygame.event.Event(pygame.QUIT))  # the whole program is to end
     first.close()
-    first.show(*scene(0.4))
-    second.show(*scene(0.4))
+    first.show(scene(0.4))
+    second.show(scene(0.4))
     assert first._window is second._window is None
 
 
@@ -82,7 +82,7 @@ def test_windows_of_others_stay():
     pygame.event.get()
     pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_a))
     pygame.event.post(pygame.event.Event(pygame.WINDOWCLOSE, window=other))
-    drawn.show(*scene())
+    drawn.show(scene())
     drawn.close()
     assert pygame.display.get_surface() is theirs
     theirs.fill("red")
@@ -98,13 +98,13 @@ def test_a_window_closed_by_others_opens_again(end):
     """Another environment's close() or anybody's pygame.quit(), after which others may have gone on."""
     pygame = canvas.load_pygame()
     drawn = renderer()
-    drawn.show(*scene())
+    drawn.show(scene())
     (pygame.display.quit if end == "display.quit" else pygame.quit)()
     if end == "quit and init":
         pygame.display.init()
         pygame.font.init()
-    drawn.show(*scene())
-    assert np.array_equal(pixels(drawn), renderer().frame(*scene()))
+    drawn.show(scene())
+    assert np.array_equal(pixels(drawn), renderer().frame(scene()))
     pygame.quit()
     drawn.close()
 
@@ -112,15 +112,15 @@ def test_a_window_closed_by_others_opens_again(end):
 def test_pygame_in_place_of_pygame_ce_is_named(monkeypatch):
     monkeypatch.delattr(canvas.load_pygame(), "Window")
     with pytest.raises(ImportError, match=r"windows need pygame-ce, and pygame .* stands in its place: pip uninst"):
-        renderer().show(*scene())
+        renderer().show(scene())
 
 
 def test_without_a_display_there_are_neither_errors_nor_warnings():
     script = (
         "import sys; sys.path.insert(0, 'tests/env'); import test_rendering as here\n"
-        "drawn = here.renderer(); frame = drawn.frame(*here.scene()); assert frame.min() < 100\n"
+        "drawn = here.renderer(); frame = drawn.frame(here.scene()); assert frame.min() < 100\n"
         "import pygame; assert not pygame.display.get_init()\n"
-        "drawn.show(*here.scene(0.1)); drawn.show(*here.scene(0.2)); drawn.close()"
+        "drawn.show(here.scene(0.1)); drawn.show(here.scene(0.2)); drawn.close()"
     )
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "PYGAME_HIDE_SUPPORT_PROMPT")
     root = Path(khop_env.__file__).parents[1]

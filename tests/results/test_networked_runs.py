@@ -7,6 +7,8 @@ import polars as pl
 import pytest
 
 from agents import make_law
+from khop_env.env.rendering import Renderer, Scene
+from khop_env.network import Outage
 from khop_env.observers import Networked
 from khop_env.results import MessageRecord, estimates_table, paper_figure, record, states_table, summarize, write_run
 from khop_env.results.video import write_video
@@ -123,6 +125,39 @@ def test_what_is_not_certified_is_drawn_without_a_box(run, tmp_path):
     assert paper_figure(replace(recording, states=unknown), paper(), tmp_path / "figure.png", agent=7).exists()
 
 
-def test_a_film_is_refused_in_words(run, tmp_path):
-    with pytest.raises(ValueError, match="a run over a network can't be filmed"):
-        write_video(run[0], paper(), tmp_path / "film.gif")
+def test_a_film_shows_what_the_simulator_would(run, tmp_path, monkeypatch):
+    """Estimates, boxes, ages and links of every frame, against the state at that time."""
+    scenes = []
+    draw = Renderer.frame
+    monkeypatch.setattr(Renderer, "frame", lambda self, scene: (scenes.append(scene), draw(self, scene))[1])
+    cut = paper().replace(schedule=Outage(agent=0, start=0.1, duration=0.2))
+    sim = simulator(cut)
+    recording = record(sim, 0.4, 0.05)
+    assert write_video(recording, cut, tmp_path / "film.mp4", fps=20).stat().st_size > 5_000
+    again = simulator(cut)
+    assert len(scenes) == 8
+    for scene in scenes:
+        for time in recording.time[(recording.time > again.t[0]) & (recording.time <= scene.t)]:
+            again.step(time - again.t[0])
+        live = Scene.of(again)
+        for name in ("t", "x", "estimates", "bounds", "up"):
+            assert np.array_equal(getattr(scene, name), getattr(live, name)), name
+        assert np.array_equal(scene.messages.age, live.messages.age)
+        assert np.array_equal(scene.messages.missed, live.messages.missed)
+        assert scene.ratio == pytest.approx(np.max(np.abs(again.errors()[0]) / live.bounds), rel=1e-12)
+    assert {bool(scene.up.all()) for scene in scenes} == {True, False}
+
+
+@pytest.mark.parametrize("kind", ["states", "inputs"])
+def test_bounds_of_a_run_on_a_changing_graph_are_those_of_its_links(kind):
+    """Of the true plant's own matrices: no error above, and inf for agents that are cut off."""
+    scenario = mixed_fleet().replace(schedule=Outage(agent=3, start=0.1, duration=10.0))
+    sim = scenario.build(law=make_law(scenario.law)).reset(3)
+    recording = record(sim, 0.3, 0.05)
+    found = getattr(recording, kind)
+    if kind == "states":
+        assert np.allclose(found.bound[-1], sim.error_bounds().bound[:, 0], rtol=1e-12)
+    target = found.layout.pair_target[found.layout.column_pair]
+    assert np.all(np.isinf(found.bound[-1, target == 3]))
+    assert np.all(np.isfinite(found.bound[0]))
+    assert np.all(np.abs(found.error) <= found.bound * (1.0 + 1e-9))

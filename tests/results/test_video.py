@@ -78,13 +78,14 @@ def test_the_gauge_shows_both_kinds_of_observers_at_that_time(run, tmp_path, mon
     recording, scenario = run
     frames = []
     draw = rendering.Renderer.frame
-    monkeypatch.setattr(rendering.Renderer, "frame", lambda self, *scene: (frames.append(scene), draw(self, *scene))[1])
+    monkeypatch.setattr(rendering.Renderer, "frame", lambda self, scene: (frames.append(scene), draw(self, scene))[1])
     write_video(recording, scenario, tmp_path / "film.mp4")
     assert len(frames) == 10
-    for (t, _, _, ratio, *_), k in zip(frames, video._samples(recording, 25.0), strict=True):
+    for scene, k in zip(frames, video._samples(recording, 25.0), strict=True):
         kinds = recording.states, recording.inputs
-        assert t == recording.time[k]
-        assert ratio == max((np.abs(kind.disagreement[k]) / kind.rho[k]).max() for kind in kinds)
+        assert scene.t == recording.time[k]
+        assert np.array_equal(scene.bounds, recording.states.bound[k])
+        assert scene.ratio == max((np.abs(kind.disagreement[k]) / kind.rho[k]).max() for kind in kinds)
 
 
 def test_the_observer_is_chosen(tmp_path, monkeypatch):
@@ -124,11 +125,11 @@ def test_a_film_that_fails_leaves_no_half(run, tmp_path, monkeypatch, name):
     path.write_bytes(b"an older film")
     draw, drawn = rendering.Renderer.frame, []
 
-    def failing(self, *scene):
+    def failing(self, scene):
         drawn.append(scene)
         if len(drawn) > 6:
             raise RuntimeError("no ink")
-        return draw(self, *scene)
+        return draw(self, scene)
 
     monkeypatch.setattr(rendering.Renderer, "frame", failing)
     with pytest.raises(RuntimeError, match="no ink"):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.env.rendering.scene import INK
+from khop_env.env.rendering.looks import INK
 from khop_env.extras import how_to_install
 from khop_env.observers import FloatArray
 

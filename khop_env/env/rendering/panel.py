@@ -1,4 +1,4 @@
-"""The strip beside the map: time, the worst ratio |e| against its guaranteed limit of 1, and the legend."""
+"""The strip beside the map: time, the worst ratio against its guaranteed limit of 1, and the legend."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from khop_env.env.rendering.canvas import Canvas, Rect
-from khop_env.env.rendering.scene import (
+from khop_env.env.rendering.links import DOWN, FRESH, draw_link, faded
+from khop_env.env.rendering.looks import (
     ALARM_COLOR,
-    EDGE_COLOR,
     INK,
     LEADER_COLOR,
     PALE,
@@ -20,10 +20,12 @@ from khop_env.env.rendering.scene import (
     Look,
     mix,
 )
+from khop_env.env.rendering.scene import Scene
 from khop_env.observers import FloatArray
 
-_GAUGE_END = 1.25  # the largest |e| that the gauge has room for
-_MOST_TYPES = 9
+_GAUGE_END = 1.25  # the largest ratio that the gauge has room for
+_ROUNDING = 1.0 + 1e-6  # of errors over certified bounds, which they may reach
+_MOST_TYPES, _MOST_TYPES_WITH_LINKS = 9, 5  # that the legend has room for
 _STAR = np.array(
     [[r * math.sin(a), r * math.cos(a)] for a, r in zip(np.arange(10) * math.pi / 5, [1, 0.45] * 5, strict=True)]
 )
@@ -51,15 +53,6 @@ def draw_task_edge(canvas: Canvas, ends: FloatArray, unit: float, thin: float, *
     canvas.dashes(ends[0], ends[1], TASK_COLOR, 2.0 * thin, 6.0 * unit, 5.0 * unit)
 
 
-def draw_arrow_head(canvas: Canvas, ends: FloatArray, before: float, unit: float) -> None:
-    """The head of a one-way link, from the first of two points (2, 2) to the second, `before` pixels ahead of it."""
-    along = ends[1] - ends[0]
-    along = along / max(float(np.hypot(*along)), 1e-9)
-    tip, across = ends[1] - before * along, np.array([-along[1], along[0]])
-    back = tip - 9.0 * unit * along
-    canvas.polygon(np.array([tip, back + 4.0 * unit * across, back - 4.0 * unit * across]), EDGE_COLOR)
-
-
 class Panel:
     """The strip: constant contents as arguments, and those that change in `draw`.
 
@@ -72,6 +65,7 @@ class Panel:
         observer: id and look of the agent whose estimates are drawn; None without estimates.
         error_label: name of the error beside the gauge.
         error_unit: its unit.
+        estimator: name of the one that estimates from messages; "" for continuous exchange.
     """
 
     def __init__(
@@ -85,31 +79,35 @@ class Panel:
         observer: tuple[str, Look] | None,
         error_label: str = "task error",
         error_unit: str = "m",
+        estimator: str = "",
     ) -> None:
         self._left, self._top, self._width, _ = rect
         self._unit, self._error_label, self._error_unit = unit, error_label, error_unit
         self._types, self._driven, self._task, self._observer = types, driven, task, observer
+        self._estimator = estimator
 
-    def draw(self, canvas: Canvas, t: float, normalized: float, task_error: float | None, hidden: int) -> None:
+    def draw(self, canvas: Canvas, scene: Scene, hidden: int, ages: FloatArray | None = None) -> None:
         """Draw it.
 
         Args:
             canvas: to draw on.
-            t: in s.
-            normalized: largest |e|.
-            task_error: if there is one.
+            scene: of the frame.
             hidden: number of guaranteed boxes that are larger than the view.
+            ages: (K,) of what the observer knows of its targets, in s; None for continuous exchange.
         """
         self._line = self._top + 12 * self._unit
-        self._write(canvas, f"t = {t:.2f} s", size=20, advance=38)
-        self._draw_gauge(canvas, normalized)
-        if task_error is not None:
-            self._write(canvas, f"{self._error_label}  {task_error:#.3g} {self._error_unit}", advance=20)
-        self._draw_legend(canvas)
+        self._write(canvas, f"t = {scene.t:.2f} s", size=20, advance=38)
+        self._draw_gauge(canvas, scene)
+        if scene.task_error is not None:
+            self._write(canvas, f"{self._error_label}  {scene.task_error:#.3g} {self._error_unit}", advance=20)
+        if self._estimator:
+            self._write(canvas, f"estimator  {self._estimator}", advance=20)
+        self._draw_legend(canvas, scene)
+        if self._observer is not None:
+            self._draw_estimates(canvas, self._observer, ages)
         if hidden:
             boxes = "box is" if hidden == 1 else "boxes are"
-            self._write(canvas, f"{hidden} {boxes} larger", size=11, color=SOFT, advance=15, indent=34)
-            self._write(canvas, "than the view", size=11, color=SOFT, indent=34)
+            self._note(canvas, f"{hidden} {boxes} larger", "than the view")
 
     def _write(
         self, canvas: Canvas, text: str, *, size: int = 13, color: str = INK, advance: float = 24, indent: float = 0
@@ -118,16 +116,23 @@ class Panel:
         canvas.text(text, at, round(size * self._unit), color=color, room=self._width - indent * self._unit)
         self._line += advance * self._unit
 
-    def _draw_gauge(self, canvas: Canvas, normalized: float) -> None:
-        """A bar up to the largest |e|; it has to end before the mark at 1."""
-        unit, kept = self._unit, normalized < 1.0
-        value = "not finite" if not math.isfinite(normalized) else f"{normalized:.3f}"
-        if kept and value == "1.000":
+    def _note(self, canvas: Canvas, *lines: str) -> None:
+        """Small print below a symbol's text."""
+        for text in lines:
+            self._write(canvas, text, size=11, color=SOFT, advance=15, indent=34)
+
+    def _draw_gauge(self, canvas: Canvas, scene: Scene) -> None:
+        """A bar up to the largest ratio; it has to end before the mark at 1, or at it if it is of a certified bound."""
+        unit, ratio, certified = self._unit, scene.ratio, scene.messages is not None
+        kept = ratio <= _ROUNDING if certified else ratio < 1.0
+        value = "not finite" if not math.isfinite(ratio) else f"{ratio:.3f}"
+        if kept and value == "1.000" and not certified:
             value = "0.999…"
-        self._write(canvas, f"largest |e|  {value}", color=INK if kept else ALARM_COLOR, advance=20)
+        label = "largest error/bound" if certified else "largest |e|"
+        self._write(canvas, f"{label}  {value}", color=INK if kept else ALARM_COLOR, advance=20)
         left, height = self._left, 12 * unit
         top, mark = self._line - height / 2, left + self._width / _GAUGE_END
-        share = min(normalized / _GAUGE_END, 1.0) if math.isfinite(normalized) else 1.0
+        share = min(ratio / _GAUGE_END, 1.0) if math.isfinite(ratio) else 1.0
         for extent, color in ((1.0, PALE), (share, "#5A5A5A" if kept else ALARM_COLOR)):
             right = left + extent * self._width
             canvas.polygon(np.array([[left, top], [right, top], [right, top + height], [left, top + height]]), color)
@@ -138,11 +143,12 @@ class Panel:
         canvas.text("guarantee: 1", (mark, self._line), size, color=SOFT, anchor=(0.85, 0.5))
         self._line += 30 * unit
 
-    def _draw_legend(self, canvas: Canvas) -> None:
+    def _draw_legend(self, canvas: Canvas, scene: Scene) -> None:
         unit, radius = self._unit, 7 * self._unit
         self._line += 12 * unit
+        most = _MOST_TYPES if scene.messages is None else _MOST_TYPES_WITH_LINKS
         for number, (text, look) in enumerate(self._types.items()):
-            if number == _MOST_TYPES:
+            if number == most:
                 self._write(canvas, f"and {len(self._types) - number} more types", indent=34)
                 break
             draw_agent(canvas, look, self._symbol(), 0.0, radius, star=False, ring=False)
@@ -152,20 +158,36 @@ class Panel:
             draw_agent(canvas, first, self._symbol(), 0.0, radius, star=True, ring=False)
             self._write(canvas, self._driven, indent=34)
         dash = np.array([[-12 * unit, 0], [12 * unit, 0]])
-        canvas.line(self._symbol() + dash, EDGE_COLOR, 2.0 * unit)
-        self._write(canvas, "communication", indent=34)
+        draw_link(canvas, self._symbol() + dash, FRESH, unit)
+        if scene.messages is None:
+            self._write(canvas, "communication", indent=34)
+        else:
+            self._write(canvas, "link, message arrived", indent=34)
+            thirds = np.linspace(self._symbol() + dash[0], self._symbol() + dash[1], 4)
+            for missed, third in zip((1.0, 3.0, 8.0), range(3), strict=True):
+                draw_link(canvas, thirds[third : third + 2], faded(missed), unit)
+            self._write(canvas, "link, messages lost", indent=34, advance=17)
+            self._note(canvas, "half beside an agent:", "what it receives")
+            self._line += 7 * unit
+        if scene.up is not None:
+            draw_link(canvas, self._symbol() + dash, DOWN, unit)
+            self._write(canvas, "link that is down", indent=34)
         if self._task:
             draw_task_edge(canvas, self._symbol() + dash, unit, unit)
             self._write(canvas, "task", indent=34)
         canvas.line(self._symbol() + dash, mix(first.color, 0.5), 2.0 * unit)
         self._write(canvas, f"path of the last {TRAIL:g} s", indent=34)
-        if self._observer is None:
-            return
+
+    def _draw_estimates(self, canvas: Canvas, observer: tuple[str, Look], ages: FloatArray | None) -> None:
+        unit, radius = self._unit, 7 * self._unit
+        first, (name, own) = next(iter(self._types.values())), observer
         self._line += 12 * unit
-        name, own = self._observer
         self._write(canvas, "One agent's estimates", advance=28)
         draw_agent(canvas, own, self._symbol(), 0.0, 0.7 * radius, star=False, ring=True)
-        self._write(canvas, name, indent=34)
+        self._write(canvas, name, indent=34, advance=24 if ages is None else 17)
+        if ages is not None:
+            self._note(canvas, *_ages(ages))
+            self._line += 9 * unit
         estimate, truth = ends = self._symbol() + np.array([[-7 * unit, 0], [9 * unit, 0]])
         canvas.line(ends, first.color, 1.0 * unit)
         canvas.marker(0.6 * radius * first.outline, truth, 0.0, first.color)
@@ -180,3 +202,12 @@ class Panel:
     def _symbol(self) -> FloatArray:
         """Middle of the symbol of the present line."""
         return np.array([self._left + 13 * self._unit, self._line])
+
+
+def _ages(ages: FloatArray) -> list[str]:
+    """Mean and largest age of what is known, and the number of agents of which nothing is."""
+    known = ages[np.isfinite(ages)]
+    lines = [f"states {known.mean():.2f} s old in the", f"mean, the oldest {known.max():.2f} s"] if known.size else []
+    if missing := ages.size - known.size:
+        lines.append(f"nothing yet of {missing} agent{'s' * (missing > 1)}")
+    return lines

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,43 +11,35 @@ from numpy.typing import NDArray
 
 from khop_env.env.rendering.camera import Camera, Labels
 from khop_env.env.rendering.canvas import Canvas, Window
+from khop_env.env.rendering.estimates import Estimates, default_observer
+from khop_env.env.rendering.links import LinkLines
+from khop_env.env.rendering.looks import PALE, SOFT, angles, headings, looks, sensible, short_names, undirected
 from khop_env.env.rendering.on_map import OnMap
-from khop_env.env.rendering.panel import Panel, draw_agent, draw_arrow_head, draw_task_edge
-from khop_env.env.rendering.scene import (
-    EDGE_COLOR,
-    PALE,
-    SOFT,
-    TRAIL,
-    Estimates,
-    angles,
-    default_observer,
-    headings,
-    looks,
-    mix,
-    sensible,
-    short_names,
-    undirected,
-)
-from khop_env.observers import FloatArray, IntArray, ObserverDesign
-from khop_env.physics import one_way_links
-from khop_env.tasks import MapCanvas, Task, World
-
-Decorate = Callable[[MapCanvas], None]
+from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
+from khop_env.env.rendering.scene import Scene
+from khop_env.env.rendering.trails import Trails
+from khop_env.network import PROFILES, Network
+from khop_env.observers import FloatArray, IntArray, Networked, ObserverDesign, Observers, PairLayout
+from khop_env.tasks import Task, World
 
 _MOST_LABELS = 40  # in larger fleets only the observer and its targets are labelled
-_FADES = 8  # shades of a trail
 
 
 class Renderer:
     """Draws the state of a fleet as pictures, or in a window.
 
-    Agents by type, communication edges solid, with an arrow where a link goes one way, and task edges dashed; for one
+    Agents by type, communication links solid, with an arrow where they go one way, and task edges dashed; for one
     agent its estimates: hollow markers at the estimated positions of its targets, each in the box that is guaranteed to
-    hold the target. Fleets in space are seen from above, fleets on a line have a row for each agent.
+    hold the target. Under a network neighbours are among the targets, boxes grow with the age of what has arrived, and
+    links whose newest messages are lost fade. Fleets in space are seen from above, fleets on a line have a row for each
+    agent.
 
     Args:
         design: the observers, with the fleet and the communication graph.
         task_edges: (E, 2) directed pairs (i, j): agent i acts on j.
+        layout: of the estimates; that of the design's observers by default.
+        network: over which agents exchange messages; None for continuous exchange.
+        estimator: its name, under a network.
         driven: indices of the agents that don't act, marked with a star.
         driven_label: their name in the legend.
         observer: index of the agent whose estimates are drawn; by default the agent with most task edges to k-hop
@@ -70,6 +61,9 @@ class Renderer:
         design: ObserverDesign,
         task_edges: IntArray,
         *,
+        layout: PairLayout | None = None,
+        network: Network | None = None,
+        estimator: str = "",
         driven: Sequence[int] = (),
         driven_label: str = "driven agent",
         observer: int | None = None,
@@ -82,10 +76,8 @@ class Renderer:
         self._fleet, self._title, self._size = fleet, title, size
         self._driven = frozenset(fleet.agent(agent) for agent in driven)
         self.observer = default_observer(design, task_edges) if observer is None else fleet.agent(observer)
-        self._estimates = Estimates(design, self.observer)
-        self._edges = undirected(np.array(design.communication.edges, int).reshape(-1, 2))
-        self._one_way = one_way_links(design.communication)
-        self._tasks, self._neighbors = undirected(task_edges), frozenset(self._edges)
+        self._estimates = Estimates(design, self.observer, layout)
+        self._tasks = undirected(task_edges)
         self._headings = headings(fleet)
         self._looks = looks(fleet.models)
         self._look = [self._looks[model.type] for model in fleet.models]
@@ -96,6 +88,8 @@ class Renderer:
         self._unit = max(0.75, min(size[0] / 900, size[1] / 720))
         self._radius = self._unit * float(np.clip(9.0 * math.sqrt(20 / agents), 4.5, 9.0))
         self._thin = self._unit * (0.5 if self._crowded else 1.0)
+        self._links = LinkLines(design.links, self._radius, self._thin)
+        self._neighbors = frozenset(self._links.pairs)
         panel = 212 * self._unit
         left, top, bottom = 58 * self._unit, 40 * self._unit, 50 * self._unit
         self._map = (left, top, size[0] - left - panel, size[1] - top - bottom)
@@ -109,29 +103,35 @@ class Renderer:
             observer=(fleet.ids[self.observer], self._look[self.observer]) if self._estimates.targets else None,
             error_label=error_label,
             error_unit=fleet.position_unit() if error_unit is None else error_unit,
+            estimator=estimator,
         )
+        self._network = "" if network is None else described(network)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
         self._dismissed = False
         self.restart()
 
     @classmethod
-    def of(cls, task: Task, world: World, **arguments: Any) -> Renderer:
+    def of(cls, task: Task, world: World, observers: Observers, **arguments: Any) -> Renderer:
         """A renderer of a task's fleet: its edges, and the agents that don't act.
 
         Args:
             task: bound to the fleet.
             world: of the task.
+            observers: of its simulator.
             arguments: other arguments of the renderer.
         """
         acting = set(task.acting(world))
         driven = [i for i in range(len(world.fleet)) if i not in acting]
         label, unit = task.driven_label, task.error_unit(world)
-        return cls(world.design, task.edges, driven=driven, driven_label=label, error_unit=unit, **arguments)
+        arguments |= {"driven": driven, "driven_label": label, "error_unit": unit, "layout": observers.layout}
+        if isinstance(observers, Networked):
+            arguments |= {"network": observers.network, "estimator": observers.estimator.name}
+        return cls(world.design, task.edges, **arguments)
 
     def restart(self) -> None:
         """Begin a new episode: clear the trails, the view and the places of labels."""
-        self._trail: deque[tuple[float, FloatArray]] = deque()
+        self._trails = Trails(self._look, 0.3 if self._crowded else 0.6, 2.0 * self._thin)
         self._drawn = -math.inf
         self._labels = Labels()
         self._camera = Camera(self._map, margin=38 * self._unit)
@@ -143,62 +143,23 @@ class Renderer:
             t: in s.
             x: (n,) state of the fleet.
         """
-        if self._trail and t < self._trail[-1][0]:
+        points = self._trails.points
+        if points and t < points[-1][0]:
             self.restart()
-        trail = self._trail
-        if (trail and t == trail[-1][0]) or (len(trail) > 1 and t - trail[-2][0] < TRAIL / 100):
-            trail.pop()  # the same time, or closer than is visible
-        trail.append((t, self._positions(x)))
-        while trail[0][0] < t - TRAIL:
-            trail.popleft()
+        self._trails.add(t, self._positions(x))
 
-    def frame(
-        self,
-        t: float,
-        x: FloatArray,
-        estimates: FloatArray,
-        normalized: float,
-        task_error: float | None = None,
-        decorate: Decorate | None = None,
-    ) -> NDArray[np.uint8]:
-        """One picture. A time before the last one's begins a new episode.
-
-        Args:
-            t: in s.
-            x: (n,) state of the fleet.
-            estimates: (P,) in the order of `design.states.layout`.
-            normalized: largest |e| = |xi| / rho of now.
-            task_error: if there is one to show.
-            decorate: draws the task's additions, below the agents.
-
-        Returns:
-            (H, W, 3) pixels, a fresh array.
+    def frame(self, scene: Scene) -> NDArray[np.uint8]:
+        """One picture (H, W, 3), a fresh array. A time before the last one's begins a new episode.
 
         Raises:
             ModuleNotFoundError: without pygame-ce.
         """
-        return self._draw(t, x, estimates, normalized, task_error, decorate).array()
+        return self._draw(scene).array()
 
-    def show(
-        self,
-        t: float,
-        x: FloatArray,
-        estimates: FloatArray,
-        normalized: float,
-        task_error: float | None = None,
-        decorate: Decorate | None = None,
-    ) -> None:
+    def show(self, scene: Scene) -> None:
         """Show the picture that `frame` would return in a window, at most 25 pictures a second.
 
         After the user has closed the window, nothing is drawn. Without a display nothing is visible.
-
-        Args:
-            t: in s.
-            x: (n,) state of the fleet.
-            estimates: (P,) in the order of `design.states.layout`.
-            normalized: largest |e| = |xi| / rho of now.
-            task_error: if there is one to show.
-            decorate: draws the task's additions, below the agents.
 
         Raises:
             ModuleNotFoundError: without pygame-ce.
@@ -207,7 +168,7 @@ class Renderer:
             return
         if self._window is None:
             self._window = Window(self._size, self._title)
-        if self._window.show(self._draw(t, x, estimates, normalized, task_error, decorate)):
+        if self._window.show(self._draw(scene)):
             self.close()
             self._dismissed = True
 
@@ -225,36 +186,31 @@ class Renderer:
         names = [name for name, model in zip(self._names, self._fleet.models, strict=True) if model.type == kind]
         return names[0] if len(names) == 1 else f"{names[0]}–{names[-1]}"
 
-    def _draw(
-        self,
-        t: float,
-        x: FloatArray,
-        estimates: FloatArray,
-        normalized: float,
-        task_error: float | None,
-        decorate: Decorate | None,
-    ) -> Canvas:
+    def _draw(self, scene: Scene) -> Canvas:
         canvas = self._canvas = self._canvas or Canvas(self._size)
-        self.remember(t, x)
-        positions, estimated = self._positions(x), self._estimates.positions(estimates)
-        self._follow(positions, estimated, t - self._drawn)
-        self._drawn = t
+        self.remember(scene.t, scene.x)
+        positions, estimated = self._positions(scene.x), self._estimates.positions(scene.estimates)
+        self._follow(positions, estimated, scene)
         everyone, targets = np.arange(len(positions)), np.array(self._estimates.targets, int)
         middles, estimate_pixels = self._pixels(positions, everyone), self._pixels(estimated, targets)
 
         canvas.clear()
         self._draw_grid(canvas)
         canvas.clip(self._map)
-        self._draw_trails(canvas, t)
-        hidden = self._draw_boxes(canvas, t, estimated)
-        if decorate is not None:
-            decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
-        self._draw_edges(canvas, middles)
-        self._draw_agents(canvas, x, middles)
-        self._draw_estimates(canvas, estimates, middles, estimate_pixels)
+        self._trails.draw(canvas, scene.t, lambda points: self._pixels(points, everyone))
+        hidden = self._draw_boxes(canvas, estimated, self._estimates.half_widths(scene.bounds))
+        if scene.decorate is not None:
+            scene.decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
+        self._links.draw(canvas, middles, scene)
+        for i, j in self._tasks:
+            if np.isfinite(middles[[i, j]]).all():
+                draw_task_edge(canvas, middles[[i, j]], self._unit, self._thin, beside=(i, j) in self._neighbors)
+        self._draw_agents(canvas, scene.x, middles)
+        self._draw_estimates(canvas, scene.estimates, middles, estimate_pixels)
         self._draw_labels(canvas, middles, estimate_pixels)
         canvas.clip(None)
-        self._panel.draw(canvas, t, normalized, task_error, hidden)
+        ages = None if scene.messages is None else self._estimates.ages(scene.messages)
+        self._panel.draw(canvas, scene, hidden, ages)
         canvas.finish()
         return canvas
 
@@ -262,11 +218,12 @@ class Renderer:
         """(N, d) positions in m, d at most 2; nan where they make no sense."""
         return sensible(x[self._fleet.position_index[:, :2]])
 
-    def _follow(self, positions: FloatArray, estimated: FloatArray, elapsed: float) -> None:
-        final = self._estimates.final_half_widths()
-        points = np.concatenate([positions, estimated - final, estimated + final])
+    def _follow(self, positions: FloatArray, estimated: FloatArray, scene: Scene) -> None:
+        half = self._estimates.half_widths_in_view(scene.bounds)
+        points = np.concatenate([positions, estimated - half, estimated + half])
         points = points[np.all(np.isfinite(points), axis=1)]
-        self._camera.follow(np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), elapsed)
+        self._camera.follow(np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), scene.t - self._drawn)
+        self._drawn = scene.t
 
     def _pixels(self, points: FloatArray, agents: IntArray) -> FloatArray:
         """(..., K, 2) pixels of points (..., K, d) in m that belong to `agents` (K,)."""
@@ -298,12 +255,17 @@ class Renderer:
             canvas.text(label, middle, size, color=SOFT, anchor=(0.5, 0.5), upright=True)
         corners = np.array([[left, top], [left + width, top], [left + width, top + height], [left, top + height]])
         canvas.polygon(corners, "#BBBBBB", 1.0)
-        canvas.text(self._title, (left, top / 2), round(14 * self._unit), room=self._size[0] - 2 * left)
+        titled = round(14 * self._unit)
+        canvas.text(self._title, (left, top / 2), titled, room=self._size[0] - 2 * left)
+        if self._network:
+            right = self._size[0] - 16 * self._unit
+            room = right - left - canvas.measure(self._title, titled)[0] - 20 * self._unit
+            canvas.text(self._network, (right, top / 2), size, color=SOFT, anchor=(1.0, 0.5), room=room)
 
-    def _draw_boxes(self, canvas: Canvas, t: float, estimated: FloatArray) -> int:
+    def _draw_boxes(self, canvas: Canvas, estimated: FloatArray, half: FloatArray) -> int:
         """Draw the guaranteed boxes, and return the number of boxes whose edges are all out of view."""
         left, top, width, height = self._map
-        half, targets = self._estimates.half_widths(t), np.array(self._estimates.targets, int)
+        targets = np.array(self._estimates.targets, int)
         low, high = self._pixels(estimated - half, targets), self._pixels(estimated + half, targets)
         hidden = 0
         for target, (x1, y1), (x2, y2) in zip(targets, low, high, strict=True):
@@ -314,31 +276,6 @@ class Renderer:
             canvas.box((x1, y2, x2 - x1, y1 - y2), self._look[target].color, min(0.1, 0.3 / len(targets)))
             hidden += x1 < left and x2 > left + width and y2 < top and y1 > top + height
         return hidden
-
-    def _draw_trails(self, canvas: Canvas, t: float) -> None:
-        times = np.array([time for time, _ in self._trail])
-        paths = self._pixels(np.array([positions for _, positions in self._trail]), np.arange(len(self._look)))
-        fresh = np.ceil((1.0 - (t - times) / TRAIL) * _FADES).astype(int)  # 0 for the oldest
-        strength = 0.3 if self._crowded else 0.6
-        for shade in range(1, _FADES + 1):
-            places = np.flatnonzero(fresh == shade)
-            if not places.size:
-                continue
-            part = paths[max(0, places[0] - 1) : places[-1] + 1]  # from the end of the previous shade
-            for agent, look in enumerate(self._look):
-                path = part[:, agent]
-                canvas.line(path[np.isfinite(path[:, 0])], mix(look.color, strength * shade / _FADES), 2.0 * self._thin)
-
-    def _draw_edges(self, canvas: Canvas, middles: FloatArray) -> None:
-        for i, j in self._edges:
-            if np.isfinite(middles[[i, j]]).all():
-                canvas.line(middles[[i, j]], EDGE_COLOR, 2.0 * self._thin)
-        for sender, receiver in self._one_way:
-            if np.isfinite(middles[[sender, receiver]]).all():
-                draw_arrow_head(canvas, middles[[sender, receiver]], 1.6 * self._radius, self._thin)
-        for i, j in self._tasks:
-            if np.isfinite(middles[[i, j]]).all():
-                draw_task_edge(canvas, middles[[i, j]], self._unit, self._thin, beside=(i, j) in self._neighbors)
 
     def _draw_agents(self, canvas: Canvas, x: FloatArray, middles: FloatArray) -> None:
         turned = angles(self._headings, x)
@@ -382,3 +319,9 @@ class Renderer:
                 canvas.line(np.array([middle, middles[visible[number]]]), SOFT, 0.75)
             text = self._names[visible[number]]
             canvas.text(text, tuple(middle), size, anchor=(0.5, 0.5), halo=True)
+
+
+def described(network: Network) -> str:
+    """A network in a line, with its profile's name if it has one."""
+    name = next((f"network {name}: " for name, profile in PROFILES.items() if profile == network), "")
+    return name + network.described().replace("+-", "±")

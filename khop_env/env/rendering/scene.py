@@ -1,160 +1,74 @@
-"""Contents of a rendered frame: the look of each type, short names, and the estimates of one agent."""
+"""The state that one frame shows: plain arrays of one environment."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from khop_env.observers import FloatArray, FunnelBank, IntArray, ObserverDesign
-from khop_env.physics import AgentModel, Fleet
+from khop_env.observers import FloatArray
+from khop_env.observers.networked import missed_rounds
+from khop_env.simulation import Simulator
+from khop_env.tasks import MapCanvas
 
-# M. Okabe and K. Ito, Color Universal Design, 2008: distinct for colour-blind readers, too; without yellow (too pale)
-# and with reddish purple reserved for task edges
-COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#000000")
-TASK_COLOR = "#CC79A7"
-EDGE_COLOR = "#6A6A6A"  # darker than task edges also where pink looks grey
-LEADER_COLOR = "#F0E442"
-ALARM_COLOR = "#D55E00"
-INK, SOFT, PALE = "#222222", "#666666", "#ECECEC"
-
-TRAIL = 2.0  # s
+Decorate = Callable[[MapCanvas], None]
 
 
-def _regular(corners: int) -> FloatArray:
-    turns = np.arange(corners) * 2.0 * np.pi / corners
-    return np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-
-
-_SHAPES = {  # corners for a radius of about one, heading along the first axis
-    "circle": _regular(32),
-    "square": 0.88 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]),
-    "arrow": np.array([[1.4, 0], [-0.95, 0.9], [-0.5, 0], [-0.95, -0.9]]),
-    "ship": np.array([[1.6, 0], [0.6, 0.75], [-1.1, 0.75], [-1.1, -0.75], [0.6, -0.75]]),
-    "diamond": 1.25 * _regular(4),
-    "triangle": 1.3 * _regular(3)[:, ::-1],
-    "hexagon": 1.1 * _regular(6),
-}
-_USUAL_SHAPE = {"integrator": "circle", "drifter": "circle", "cart": "square", "unicycle": "arrow", "vessel": "ship"}
-_POINTED, _ROUND = ("arrow", "ship", "triangle"), ("diamond", "triangle", "hexagon", "square", "circle")
-_FAR = 1e9  # m: a state that ran further away, or isn't finite, isn't drawn
-
-
-@dataclass(frozen=True)
-class Look:
-    """How the agents of one type are drawn.
+class Messages(NamedTuple):
+    """What has arrived over a network.
 
     Attributes:
-        color: "#RRGGBB".
-        outline: (K, 2) corners of the marker, heading along the first axis, for a radius of one.
+        age: (pairs,) of the newest state that each pair of the observers' layout has received, in s; inf for none.
+        missed: (L,) rounds by which the newest message over each link is older than one that comes on time; inf where
+            nothing has arrived.
     """
 
-    color: str
-    outline: FloatArray
+    age: FloatArray
+    missed: FloatArray
 
 
-def looks(models: Sequence[AgentModel]) -> dict[str, Look]:
-    """A colour and a shape for each type, no two alike while there are any left; agents with a heading are pointed."""
-    free = list(_SHAPES)
-    found: dict[str, Look] = {}
-    for model in models:
-        if model.type in found:
-            continue
-        fitting = [_USUAL_SHAPE.get(model.type), *(_POINTED if "heading" in model.states else _ROUND), *_SHAPES]
-        shape = next(name for name in fitting if name in free)
-        free = [name for name in free if name != shape] or list(_SHAPES)
-        found[model.type] = Look(COLORS[len(found) % len(COLORS)], _SHAPES[shape])
-    return found
-
-
-def short_names(fleet: Fleet) -> list[str]:
-    """Per agent the first letters of its type, as many as distinguish the types, and its number."""
-    kinds = list(dict.fromkeys(model.type for model in fleet.models))
-    length = next(n for n in range(len(max(kinds, key=len)) + 1) if len({kind[:n] for kind in kinds}) == len(kinds))
-    return [model.type[:length] + name.rpartition("_")[2] for model, name in zip(fleet.models, fleet.ids, strict=True)]
-
-
-def mix(color: str, share: float) -> tuple[int, int, int]:
-    """A share of a colour "#RRGGBB" in white."""
-    red, green, blue = (round(255 + share * (int(color[k : k + 2], 16) - 255)) for k in (1, 3, 5))
-    return red, green, blue
-
-
-def undirected(edges: IntArray) -> list[tuple[int, int]]:
-    """Each undirected pair of (E, 2) edges once."""
-    return sorted({(min(i, j), max(i, j)) for i, j in edges.tolist() if i != j})
-
-
-def default_observer(design: ObserverDesign, task_edges: IntArray) -> int:
-    """The agent with most task edges to k-hop targets, the first of several."""
-    observers = [i for i, j in task_edges.tolist() if (j, i) not in design.links.index]
-    return int(np.bincount(observers, minlength=len(design.fleet)).argmax())
-
-
-def headings(fleet: Fleet) -> IntArray:
-    """(N,) index of each agent's heading in the fleet's state; -1 for agents without a heading."""
-    offsets = fleet.state_offset[:-1].tolist()
-    return np.array(
-        [
-            offset + list(model.states).index("heading") if "heading" in model.states else -1
-            for offset, model in zip(offsets, fleet.models, strict=True)
-        ]
-    )
-
-
-class Estimates:
-    """Estimated positions of one agent's targets, and the guaranteed bounds on their errors.
-
-    Args:
-        design: the observers.
-        observer: index of the agent.
+class Scene(NamedTuple):
+    """A fleet and its observers at one instant.
 
     Attributes:
-        targets: indices of the agents that it estimates.
+        t: in s.
+        x: (n,) state of the fleet.
+        estimates: (P,) in the order of the observers' layout.
+        bounds: (P,) guaranteed bound on the error of each; inf where there is none.
+        ratio: largest |e| = |xi| / rho; under a network the largest error over its certified bound.
+        task_error: if there is one to show.
+        decorate: draws the task's additions, below the agents.
+        messages: under a network.
+        up: (L,) whether each of the design's links is up; None for all.
     """
 
-    def __init__(self, design: ObserverDesign, observer: int) -> None:
-        fleet, layout = design.fleet, design.states.layout
-        slots = {target: offset for (agent, target), offset in layout.slot.items() if agent == observer}
-        self.targets = sorted(slots)
-        first = {block.agent: block.rows.start for block in layout.blocks}
-        d = min(2, fleet.position_dim)
-        place = [fleet.position_index[j, :d] - fleet.state_offset[j] for j in self.targets]
-        self._columns = np.array([slots[j] + p for j, p in zip(self.targets, place, strict=True)], int).reshape(-1, d)
-        rows = np.array([first[j] + p for j, p in zip(self.targets, place, strict=True)], int).reshape(-1)
-        self._delta = FunnelBank([design.states.bounds[row] for row in rows])
-        self._share = design.states.share[layout.column_pair[self._columns]]
-        own = headings(fleet)
-        self._heading = [slots[j] + own[j] - fleet.state_offset[j] if own[j] >= 0 else -1 for j in self.targets]
+    t: float
+    x: FloatArray
+    estimates: FloatArray
+    bounds: FloatArray
+    ratio: float
+    task_error: float | None = None
+    decorate: Decorate | None = None
+    messages: Messages | None = None
+    up: NDArray[np.bool_] | None = None
 
-    def positions(self, estimates: FloatArray) -> FloatArray:
-        """(K, d) estimated positions in m, d at most 2; nan where they can't be drawn. `estimates` is (P,)."""
-        return sensible(estimates[self._columns])
-
-    def headings(self, estimates: FloatArray) -> FloatArray:
-        """(K,) estimated headings in rad, 0 where there are none. `estimates` is (P,)."""
-        return angles(self._heading, estimates)
-
-    def half_widths(self, t: float) -> FloatArray:
-        """(K, d) of the box around each estimate that is guaranteed to hold the target, in m, at `t` s."""
-        delta = self._delta.evaluate(np.array([t]), np.empty((len(self._delta), 1)))
-        return self._share * delta.reshape(self._columns.shape)
-
-    def final_half_widths(self) -> FloatArray:
-        """(K, d) of the box as t goes to infinity, in m."""
-        return self._share * self._delta.infimum().reshape(self._columns.shape)
-
-
-def sensible(positions: FloatArray) -> FloatArray:
-    """(K, d) positions, nan where they are not finite or further away than can be drawn."""
-    with np.errstate(invalid="ignore"):
-        near = np.all(np.abs(positions) < _FAR, axis=-1, keepdims=True)
-    return np.where(near, positions, np.nan)
-
-
-def angles(columns: Sequence[int] | IntArray, values: FloatArray) -> FloatArray:
-    """(K,) `values` at the columns, and 0 where the column is -1 or the value isn't finite."""
-    columns = np.asarray(columns, int)
-    chosen = values[np.maximum(columns, 0)] if columns.size else np.zeros(0)
-    return np.where((columns >= 0) & np.isfinite(chosen), chosen, 0.0)
+    @staticmethod
+    def of(simulator: Simulator, task_error: float | None = None, decorate: Decorate | None = None) -> Scene:
+        """The present state of a simulator's first environment, with the largest ratio of its `running_extremes`."""
+        state, observers, extremes = simulator.state, simulator.observers, simulator.running_extremes
+        up, messages = observers.links_up(state), None
+        if observers.by_messages:
+            messages = Messages(observers.information(state).age[:, 0], missed_rounds(observers, state)[:, 0])
+        return Scene(
+            t=float(simulator.t[0]),
+            x=simulator.x[0],
+            estimates=simulator.estimates[0],
+            bounds=simulator.error_bounds().bound[:, 0],
+            ratio=float((extremes.relative if observers.by_messages else extremes.kept())[0]),
+            task_error=task_error,
+            decorate=decorate,
+            messages=messages,
+            up=None if up is None else up[:, 0].copy(),
+        )
