@@ -6,7 +6,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from khop_env.env import BatchedEnv, KHopEnv, Settings
+import khop_env
 from khop_env.env.rendering import Messages, Renderer, Scene
 from khop_env.env.rendering.links import DOWN, FRESH, faded, stroke_of
 from khop_env.env.rendering.panel import _ages
@@ -15,7 +15,6 @@ from khop_env.network import Network, Outage
 from khop_env.observers import Networked
 from khop_env.scenarios import mixed_fleet, paper
 from khop_env.simulation import Simulator
-from khop_env.tasks import Consensus
 from tests.env.drawing import TASK, design
 
 X = np.array([0.0, 0.0, 3.0, 0.0, 6.0, 0.0])
@@ -190,12 +189,15 @@ class TestPanel:
 
 
 def test_an_environment_over_a_network_renders():
-    scenario = paper()
-    simulator = scenario.build(observers=Networked("lossy:loss=0.6,burst=5", "relay"))
-    env = KHopEnv(BatchedEnv(simulator, Consensus(), Settings()), name="consensus_v0", render_mode="rgb_array")
+    env = khop_env.make("consensus_v0", network="lossy:loss=0.6,burst=5", render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
     env.step({agent: np.zeros(env.action_space(agent).shape, np.float32) for agent in env.agents})
     second = env.render()
     assert first.shape == second.shape == (720, 900, 3)
     assert not np.array_equal(first, second)
+    renderer, simulator = env._renderer, env.batched.simulator
+    known = [target for observer, target in simulator.observers.layout.slot if observer == renderer.observer]
+    assert renderer._estimates.targets == sorted(known)
+    assert "60 % lost in bursts of 5" in renderer._network
+    assert renderer._panel._estimator == "ppso"
