@@ -101,6 +101,8 @@ def network(
             unfinished = ("interrupted", INTERRUPTED)
         except SolveError as error:
             unfinished = (str(error), 2)
+    acts = "estimates" if observe == MotionOption.ESTIMATE else "true states"
+    loop = f"{scenario.name} under {scenario.law.name} on {acts}"
     rest = iter(rows)
     continuous, found, *swept = [list(itertools.islice(rest, count)) for count in counts]
     if as_json:
@@ -108,12 +110,10 @@ def network(
         result = {"scenario": scenario.name, "rows": listed[0], "continuous": listed[1][0] if listed[1] else None}
         print_json(result | ({"swept": listed[2]} if swept else {}))
     elif found:
-        acts = "estimates" if observe == MotionOption.ESTIMATE else "true states"
         count = f"{episodes} episode{'s' if episodes > 1 else ''}"
-        title = f"{scenario.name} under {scenario.law.name} on {acts}, {count}, the same for every row"
-        _print(scenario, continuous[0], found, title)
+        _print(scenario, continuous[0], found, f"{loop}, {count}, the same for every row")
     if swept and unfinished is None:
-        _draw(scenario, continuous[0], swept, base, figure)
+        _draw(loop, scenario, continuous[0], swept, base, figure)
     if unfinished is not None:
         why, status = unfinished
         say(f"khop: {why}; {'above are the rows that were' if found else 'no row was'} measured until then")
@@ -220,12 +220,17 @@ def _between(ratios: Iterable[float | None]) -> str:
 
 
 def _draw(
-    scenario: Scenario, continuous: NetworkRow, swept: Sequence[Sequence[NetworkRow]], base: Network | None, path: Any
+    loop: str,
+    scenario: Scenario,
+    continuous: NetworkRow,
+    swept: Sequence[Sequence[NetworkRow]],
+    base: Network | None,
+    path: Any,
 ) -> None:
     from khop_env.results.curves import network_figure
 
     assert base is not None
-    title = f"{scenario.name} under {scenario.law.name}: {base.described()}, but for what is varied"
+    title = f"{loop}: {base.described()}, but for what is varied"
     with mistakes(), waiting(f"drawing {path}"):
         network_figure(swept[0], swept[1], continuous, path, title, scenario.fleet.position_unit())
     say(f"figure: {path}")
