@@ -296,27 +296,6 @@ def print_design(report: Mapping[str, Any]) -> None:
         print_text(f"not feasible: {report['error']}")
 
 
-def print_network(report: Mapping[str, Any]) -> None:
-    """What is certain over a network."""
-    print_text(f"network: {report['network']}; estimator {report['estimator']}")
-    for each in report["types"]:
-        print_text(f"{each['type']}: {each['reason'] or 'certified'}")
-    print_table(
-        ("estimated", "links away", "expected age", "certified bound", "ideal bound"),
-        [
-            (
-                f"{each['component']} of {each['type']}",
-                str(each["hops"]),
-                "never arrives" if each["expected_age"] is None else f"{1e3 * each['expected_age']:.4g} ms",
-                "none" if each["certified"] is None else f"{each['certified']:.3g} {each['unit']}",
-                "known exactly" if each["hops"] == 1 else _number(each["ideal"], each["unit"]),
-            )
-            for each in report["bounds"]
-        ],
-        "Certified bounds at the mean age of states that come by one path; ideal ones after the transient",
-    )
-
-
 def _spectrum_row(target: Mapping[str, Any]) -> tuple[str, ...]:
     ids = target["k_hop"]
     members = ", ".join(ids[:_SHOWN_IDS]) + (f" and {len(ids) - _SHOWN_IDS} more" if len(ids) > _SHOWN_IDS else "")

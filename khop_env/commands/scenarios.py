@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import typer
 
 from khop_env.commands.common import (
@@ -66,14 +69,35 @@ def check(
     if as_json:
         print_json(report)
     else:
-        from khop_env.terminal import print_design, print_network
+        from khop_env.terminal import print_design
 
         print_design(report)
         if over is not None and report["network"] is not None:
             typer.echo()
-            print_network(report["network"])
+            _print_network(report["network"])
     if not report["feasible"]:
         raise typer.Exit(1)
+
+
+def _print_network(report: Mapping[str, Any]) -> None:
+    """What is certain over a network."""
+    print_text(f"network: {report['network']}; estimator {report['estimator']}")
+    for each in report["types"]:
+        print_text(f"{each['type']}: {each['reason'] or 'certified'}")
+    print_table(
+        ("estimated", "links away", "expected age", "certified bound", "ideal bound"),
+        [
+            (
+                f"{each['component']} of {each['type']}",
+                str(each["hops"]),
+                "never arrives" if each["expected_age"] is None else f"{1e3 * each['expected_age']:.4g} ms",
+                "none" if each["certified"] is None else f"{each['certified']:.3g} {each['unit']}",
+                "known exactly" if each["hops"] == 1 else f"{each['ideal']:.3g} {each['unit']}",
+            )
+            for each in report["bounds"]
+        ],
+        "Certified bounds at the mean age of states that come by one path; ideal ones after the transient",
+    )
 
 
 def export(name: ScenarioArgument) -> None:
