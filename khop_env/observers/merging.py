@@ -130,18 +130,22 @@ def merge(
                     found = True
         if not found:
             continue
+        for c in range(components[pair]):  # the batch innermost: neighbouring environments lie side by side
+            q = column[pair] + c
+            for b in range(batch):
+                way = choice[b]
+                if way >= 0:
+                    at = place[link[way], b]
+                    center[q, b] = sent[at, state[way] + c, b]
+                    error[q, b] = noise if error_row[way] < 0 else sent[at, error_row[way] + c, b]
         for b in range(batch):
             way = choice[b]
-            if way < 0:
-                continue
-            at = place[link[way], b]
-            for c in range(components[pair]):
-                center[column[pair] + c, b] = sent[at, state[way] + c, b]
-                error[column[pair] + c, b] = noise if error_row[way] < 0 else sent[at, error_row[way] + c, b]
-            hops[pair, b] = 1.0 if hops_row[way] < 0 else sent[at, hops_row[way], b] + 1.0
-            arrived[pair, b] = now[b]
-            lag[pair, b] = t[b] - sent[at, TIME, b]
-            behind = behind or lag[pair, b] > 1e-12
+            if way >= 0:
+                at = place[link[way], b]
+                hops[pair, b] = 1.0 if hops_row[way] < 0 else sent[at, hops_row[way], b] + 1.0
+                arrived[pair, b] = now[b]
+                lag[pair, b] = t[b] - sent[at, TIME, b]
+                behind = behind or lag[pair, b] > 1e-12
     return behind
 
 

@@ -88,6 +88,7 @@ class Networked:
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
         self._activity = None if design.schedule is None else design.activity()
         self._up = np.ones((len(design.links), num_envs), np.bool_)
+        self._of_memory = [(name, _CHANNEL + name) for name in self.channel.allocate()]
         self._lag = np.zeros((layout.pairs, num_envs))
         self._dt = self.longest_step
         self._fastest = self._fewest_rounds()
@@ -202,7 +203,7 @@ class Networked:
     # -- parts ---------------------------------------------------------------------------------------------------
 
     def _of_channel(self, memory: Memory) -> Memory:
-        return {name[len(_CHANNEL) :]: values for name, values in memory.items() if name.startswith(_CHANNEL)}
+        return {name: memory[key] for name, key in self._of_memory}
 
     def _begin_round(self, state: PlantState, due: NDArray[np.bool_]) -> None:
         """Measure what is to be sent, and decide what is lost and what arrives."""
