@@ -19,7 +19,7 @@ from khop_env.env.readout import Sources, summarize
 from khop_env.env.settings import Settings
 from khop_env.env.state import EnvState, Infos, Step, signature
 from khop_env.observers import FloatArray, IntArray
-from khop_env.simulation import Simulator
+from khop_env.simulation import ReceivedStates, Simulator, links_up
 from khop_env.tasks import Outcome, Task, World
 
 
@@ -92,8 +92,9 @@ class BatchedEnv:
         self._scale = np.where(np.isfinite(self._limit), self._limit, 1.0)
         observers = simulator.observers
         bounded = len(state.memory["estimate"]) if self._read_observations.uses_bounds else 0
-        changing = len(simulator.design.links) if simulator.design.schedule is not None else 0
-        known = 4 * observers.layout.pairs if observers.by_messages else changing
+        changing = simulator.design.schedule is not None and not observers.by_messages
+        self._received = ReceivedStates(simulator.design, observers, self.num_envs) if changing else None
+        known = len(simulator.design.links) if changing else 4 * observers.layout.pairs * observers.by_messages
         self._sources = Sources(
             state.x,
             state.memory["estimate"],
@@ -294,8 +295,13 @@ class BatchedEnv:
             observers.bound(state, sources.bound)
         if observers.by_messages:
             summarize(*observers.information(state), state.t, self.settings.control_period, sources.known)
-        elif sources.known.size:
-            sources.known[...] = observers.links_up(state)
+        elif self._received is not None:
+            up = links_up(self.simulator.design, observers, state)
+            sources.known[...] = up
+            if self.settings.observe == "estimate":
+                sources = sources._replace(estimate=self._received.states(state, up))
+                if sources.bound.size:
+                    self._received.bounds(sources.bound, up)
         if sources.task.size:
             self.task.observe(self.world, sources.task)
         flat = self._read_observations(sources, clipped)

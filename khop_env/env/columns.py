@@ -129,12 +129,16 @@ class ObservationColumns:
     def _slot(self, i: int, number: int, slot: Slot) -> list[Column]:
         fleet, name, model = self._fleet, f"slot{number}", self._fleet.models[slot.agent]
         estimated = self._by_messages or not slot.heard  # otherwise its state is received
-        estimate = estimated and self._observe != "oracle"
-        gate = -1  # a neighbour's state is received while its link is up
+        link = gate = -1  # of a neighbour, whose state is received while it is up
         if self._changing and slot.heard and self._observe != "oracle":
-            gate = self._design.links.index[slot.agent, i]
+            link = self._design.links.index[slot.agent, i]
+            if self._observe == "estimate" and (i, slot.agent) in self._layout.slot:
+                estimated = True  # without relays; `ReceivedStates` has its state while it is received
+            else:
+                gate = link
+        estimate = estimated and self._observe != "oracle"
         columns = [
-            *self._known_columns(i, name, slot, estimate, gate),
+            *self._known_columns(i, name, slot, estimate, link, gate),
             _flag(f"{name}.task_edge", slot.task_edge),
             *(self._type(name, model.type) if len(self._types) > 1 else ()),
         ]
@@ -165,12 +169,18 @@ class ObservationColumns:
             return [Column(column.field) for column in columns]
         return columns
 
-    def _known_columns(self, i: int, name: str, slot: Slot, estimate: bool, gate: int) -> list[Column]:
-        """Whether, when and over how many links something has arrived about the agent: constants without messages."""
+    def _known_columns(self, i: int, name: str, slot: Slot, estimate: bool, link: int, gate: int) -> list[Column]:
+        """Whether, when and over how many links something has arrived about the agent: constants without messages,
+        but for the `link` from a neighbour that comes and goes, and `gate` where nothing is known while it is down.
+        """
         if not self._by_messages:
+            valid, heard = _flag(f"{name}.valid", True), _flag(f"{name}.heard", slot.heard)
             hops = Column(Field(f"{name}.hops", "", 0.0, float(self._design.k)), value=float(slot.hops))
-            flags = [_flag(f"{name}.valid", True), _flag(f"{name}.heard", slot.heard), hops]
-            return flags if gate < 0 else [Column(flag.field, KNOWN, gate) for flag in flags]  # one hop: all are 1 or 0
+            return [
+                valid if gate < 0 else Column(valid.field, KNOWN, gate),
+                heard if link < 0 else Column(heard.field, KNOWN, link),
+                hops,
+            ]
         layout, most_hops = self._layout, float(max(self._design.k, len(self._fleet) - 1))  # detours are possible
         pair = int(layout.column_pair[layout.slot[i, slot.agent]])
         valid, *others = (

@@ -153,7 +153,8 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
                     values[e] = estimate[row, first + e]
             elif kind == BOUND:
                 for e in range(width):
-                    values[e] = sources.bound[row, first + e]
+                    bound = sources.bound[row, first + e]
+                    values[e] = bound if bound < np.inf else high  # no bound: the largest value, and nothing clipped
             elif kind == INPUT:
                 for e in range(width):
                     values[e] = sources.inputs[row, first + e]

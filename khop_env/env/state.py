@@ -26,7 +26,8 @@ SHARED_INFOS = (
 )
 """Keys of every info beside the task's own: the largest |xi| / rho, and error over the observer's own bound, of all
 observers of states and inputs since the last action, below 1 by guarantee; entries of this agent's observation and
-action that were clipped. Under a network the bound is the certified one, neighbours' states included."""
+action that were clipped; bounds that are the largest value because there is none don't count. Under a network the
+bound is the certified one, neighbours' states included."""
 
 Infos = dict[str, NDArray[Any]]
 Step = tuple[Float32Array, FloatArray, NDArray[np.bool_], NDArray[np.bool_], Infos]

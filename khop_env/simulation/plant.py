@@ -79,7 +79,7 @@ class FleetPlant:
         states = self._bind(state)
         if self.law is not None:
             assert self.views is not None
-            u = self.law(self._t, self.views.update(state.x, state.memory["estimate"]))
+            u = self.law(self._t, self.views.update(state))
             if np.shape(u) != (self.num_envs, self.fleet.m):
                 raise ValueError(
                     f"law {self.law!r} returned inputs of shape {np.shape(u)}; expected (environments, inputs) = "

@@ -10,8 +10,9 @@ import numpy as np
 
 from khop_env.brief import brief
 from khop_env.compiled import compiled
-from khop_env.observers import FloatArray, IntArray, ObserverDesign, Observers
+from khop_env.observers import FloatArray, IntArray, ObserverDesign, Observers, PlantState
 from khop_env.physics import Fleet, read_only
+from khop_env.simulation.received import ReceivedStates, links_up
 
 Observe = Literal["estimate", "oracle", "local"]
 OBSERVE: tuple[Observe, ...] = ("estimate", "oracle", "local")
@@ -26,7 +27,7 @@ class View:
         x: (B, n) states; agent i's law may read its own slice only.
         edges: (E, 2) directed task edges: agent i = edges[:, 0] acts on agent j = edges[:, 1], which is -1 where j
             isn't in the fleet.
-        known: (B, E) whether i knows j's state: j is its neighbour, or it estimates j.
+        known: (B, E) whether i knows j's state: j is its neighbour, over a link that is up now, or it estimates j.
         displacement: (B, E, d) position of j, received or estimated by i, minus i's own position and minus the
             displacement that the task asks for, in m; 0 where not known.
 
@@ -57,7 +58,10 @@ class Law(Protocol):
 
 
 class ViewBuilder:
-    """Fills a `View` from the simulator's states and estimates.
+    """Fills a `View` from a simulator's state.
+
+    Where links come and go and no messages are exchanged, a neighbour is known while its link is up; in designs
+    without relays, which estimate neighbours, too, it is estimated meanwhile.
 
     Args:
         design: who sends to whom.
@@ -76,21 +80,31 @@ class ViewBuilder:
         self._own = np.ascontiguousarray(position[edges[:, 0]])
         self._other = np.ascontiguousarray(position[edges[:, 1]])
         self._kind = np.zeros(len(edges), np.int64)
+        self._design, self._observers = design, observers
+        changing = design.schedule is not None and not observers.by_messages and observe != "oracle"
+        self._received = ReceivedStates(design, observers, num_envs) if changing else None
+        link = np.full(len(edges), -1)
         for number, (i, j) in enumerate(edges.tolist()):
             neighbor = (j, i) in design.links.index
-            if observe == "oracle" or (neighbor and not observers.by_messages):
+            if neighbor and changing and (observe == "local" or (i, j) not in observers.layout.slot):
+                link[number] = design.links.index[j, i]
+                continue
+            if observe == "oracle" or (neighbor and not observers.by_messages and not changing):
                 continue
             if observe == "estimate" or neighbor:
                 self._kind[number] = 1
                 self._other[number] += observers.layout.slot[i, j] - offset[j]
             else:
                 self._kind[number] = 2
+        self._gated = np.flatnonzero(link >= 0)
+        self._link = link[self._gated]
+        self._known = np.repeat(self._kind[:, None] < 2, num_envs, axis=1)
         self._columns = np.zeros((len(edges), fleet.position_dim, num_envs))
         self.view = View(
             fleet=fleet,
             x=np.zeros((num_envs, fleet.n)),
             edges=read_only(edges[:]),
-            known=np.broadcast_to(self._kind < 2, (num_envs, len(edges))),
+            known=read_only(self._known.T),
             displacement=read_only(self._columns.transpose(2, 0, 1)),
         )
 
@@ -99,15 +113,25 @@ class ViewBuilder:
         """Per edge the sources of the compiled loop: kind of value (E,), rows of own and of other position (E, d)."""
         return self._kind, self._own, self._other
 
-    def update(self, x: FloatArray, estimate: FloatArray) -> View:
-        """The view at states `x` (n, B) and estimates (P, B)."""
+    def update(self, state: PlantState) -> View:
+        """The view at a state."""
+        x, estimate = state.x, state.memory["estimate"]
+        up = None
+        if self._received is not None:
+            up = links_up(self._design, self._observers, state)
+            estimate = self._received.states(state, up)
         displacements(self._kind, self._own, self._other, x, estimate, self._columns)
+        if up is not None:
+            self._known[self._gated] = known = up[self._link]
+            self._columns[self._gated] = np.where(known[:, None], self._columns[self._gated], 0.0)
         view = self.view
         # made once, and again in a copy of this object, whose views would be of the original's arrays
         if view.x.base is not x:
             view.x = read_only(x.T)
         if view.displacement.base is not self._columns:
             view.displacement = read_only(self._columns.transpose(2, 0, 1))
+        if view.known.base is not self._known:
+            view.known = read_only(self._known.T)
         return view
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,41 +13,68 @@ from numpy.typing import NDArray
 
 from khop_env.env import EnvState, KHopEnv
 from khop_env.observers import IntArray, Networked, PairLayout
+from khop_env.simulation import links_up
 from khop_env.testing.equality import difference
 from khop_env.testing.subject import Fault, Subject, called, play
 from khop_env.testing.views import copies
 
 _VISIBLE = ("t", "x", "estimate")  # the parts of the simulator's state that observations may depend on
-_OF_LINKS = ("key",)  # with changing links, and without messages, which of them are up
 _OF_PAIRS = ("bound", "stamp", "hops", "arrived")  # and under a network what an agent knows of its own estimates
 _LOSS = 0.5  # of messages, so that about half of an agent's neighbours don't get its next one
 
 
-def leak(subject: Subject) -> None:
+def leak(subject: Subject) -> str | None:
     """Observations depend on accessible information only."""
     env = subject.own()
     for number, step in enumerate(play(env, 4, subject.seed, reset_seed=subject.seed)):
         for agent, observation in step["observations"].items():
             if found := difference(observation, env.observe(agent), f"observations[{agent!r}]"):
                 raise Fault(f"{called(number, step)} and observe() differ: {found}")
-    fleet, observers, mode = env.batched.fleet, env.batched.simulator.observers, env.batched.settings.observe
-    hops = dict(nx.all_pairs_shortest_path_length(env.batched.simulator.design.communication))
+    settings, design = env.batched.settings, env.batched.simulator.design
+    fleet, observers, mode = env.batched.fleet, env.batched.simulator.observers, settings.observe
+    hops = dict(nx.all_pairs_shortest_path_length(design.communication))
+    by_links = design.schedule is not None and not observers.by_messages  # which come and go
     direct = 0 if observers.by_messages else 1
-    reach = env.batched.simulator.design.k if mode == "oracle" else direct
+    reach = design.k if mode == "oracle" else direct
     for j, agent in enumerate(fleet.ids):
         near = {i for i in range(len(fleet)) if hops[j].get(i, np.inf) <= reach}
-        _require(env, near, f"the true state of {agent!r}", lambda state: state.simulator.x, [fleet.state_slice(j)])
-        _require(env, {j}, f"the input in force of {agent!r}", lambda state: state.inputs, [fleet.input_slice(j)])
+        move = _edit(lambda state: state.simulator.x, fleet.state_slice(j))
+        if by_links and mode != "oracle":
+            near = {j, *_receivers(env, move, j)}
+        _require(env, near, f"the true state of {agent!r}", move, bounds=not by_links)
+        edit = _edit(lambda state: state.inputs, fleet.input_slice(j))
+        _require(env, {j}, f"the input in force of {agent!r}", edit)
         made = _rows_of(observers.layout, j)
         seen_by = set() if mode == "oracle" or (mode == "local" and not observers.by_messages) else {j}
-        _require(env, seen_by, f"an estimate that {agent!r} makes", _array("estimate"), [made[0]])
+        _require(env, seen_by, f"an estimate that {agent!r} makes", _edit(_array("estimate"), made[0]))
         for name in _OF_PAIRS if observers.by_messages else ():
-            _require(env, {j}, f"{agent!r}'s {name}", _array(name), [made[0] if name == "bound" else made[1]])
+            edit = _edit(_array(name), made[0] if name == "bound" else made[1])
+            _require(env, {j}, f"{agent!r}'s {name}", edit)
     for name in env.get_state().simulator.arrays():
-        if name not in (*_VISIBLE, *(_OF_PAIRS if observers.by_messages else _OF_LINKS)):
-            _require(env, set(), f"the simulator's {name}", _array(name), [...])
+        edit = _edit(_array(name), ...)
+        if by_links and name == "key":
+            cut = set() if mode == "oracle" else _receivers(env, edit, None)
+            _require(env, cut, "the draw of links to other agents", edit, bounds=False)
+        elif name not in (*_VISIBLE, *(_OF_PAIRS if observers.by_messages else ())):
+            _require(env, set(), f"the simulator's {name}", edit)
     if isinstance(observers, Networked) and mode != "oracle":
         _lost_messages(env, observers, subject.seed)
+    if by_links and settings.bounds:
+        return "but for guaranteed bounds, which follow from all links that are up: agents can't know them"
+    return None
+
+
+def _receivers(env: KHopEnv, write: Callable[[EnvState], None], sender: int | None) -> set[int]:
+    """Receivers of the links from an agent that are up before or after an edit; None: of links that it changes."""
+    simulator, saved, edited = env.batched.simulator, env.get_state(), env.get_state()
+    write(edited)
+    up = []
+    for state in (edited, saved):
+        env.set_state(state)
+        up.append(links_up(simulator.design, simulator.observers, simulator.state)[:, 0].copy())
+    links = simulator.design.links
+    concerned = up[0] != up[1] if sender is None else (up[0] | up[1]) & (links.sender == sender)
+    return set(links.receiver[concerned].tolist())
 
 
 def _rows_of(layout: PairLayout, observer: int) -> tuple[IntArray, IntArray]:
@@ -108,12 +135,23 @@ def _other(values: NDArray[Any]) -> NDArray[Any]:
     return ~values if values.dtype.kind == "b" else values + values.dtype.type(1)
 
 
-def changed_by(env: KHopEnv, write: Callable[[EnvState], None]) -> dict[int, int]:
+def _edit(read: Callable[[EnvState], Any], part: Any) -> Callable[[EnvState], None]:
+    """An edit of a part of an array of the saved state."""
+
+    def write(state: EnvState) -> None:
+        array = read(state)
+        array[part] = _other(array[part])
+
+    return write
+
+
+def changed_by(env: KHopEnv, write: Callable[[EnvState], None], bounds: bool = True) -> dict[int, int]:
     """Agents whose observation changes if the environment's state is edited.
 
     Args:
         env: an environment in mid-episode; its state is restored.
         write: edits the state returned by `get_state`.
+        bounds: whether guaranteed bounds in slots count.
 
     Returns:
         The first changed column, by the agent's index in the fleet.
@@ -127,22 +165,20 @@ def changed_by(env: KHopEnv, write: Callable[[EnvState], None]) -> dict[int, int
     env.set_state(saved)
     changed = {}
     for agent, observation in before.items():
-        if observation.tobytes() != after[agent].tobytes():
-            bits = observation.view(np.uint32) != after[agent].view(np.uint32)
+        bits = observation.view(np.uint32) != after[agent].view(np.uint32)
+        if not bounds:
+            bits[[column for column, name in enumerate(env.layout(agent).names) if ".bound." in name]] = False
+        if bits.any():
             changed[fleet.agent(agent)] = int(np.flatnonzero(bits)[0])
     return changed
 
 
-def _require(env: KHopEnv, allowed: set[int], text: str, read: Callable[[EnvState], Any], parts: Iterable[Any]) -> None:
-    """Check that edits in parts of an array of the saved state change observations of allowed agents only."""
-
-    def write(state: EnvState) -> None:
-        for part in parts:
-            array = read(state)
-            array[part] = _other(array[part])
-
+def _require(
+    env: KHopEnv, allowed: set[int], text: str, write: Callable[[EnvState], None], bounds: bool = True
+) -> None:
+    """Check that an edit of the saved state changes observations of allowed agents only."""
     ids = env.batched.fleet.ids
-    for i, column in changed_by(env, write).items():
+    for i, column in changed_by(env, write, bounds).items():
         if i not in allowed:
             names = env.layout(ids[i]).names
             column_name = names[column] if column < len(names) else "beyond its layout"

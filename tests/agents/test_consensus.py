@@ -12,7 +12,7 @@ from khop_env.scenarios import LawChoice, mixed_fleet, paper
 def law_input(simulator):
     """u of the law at the simulator's present state."""
     plant, state = simulator.plant, simulator.state
-    return plant.law(state.t, plant.views.update(state.x, state.memory["estimate"]))
+    return plant.law(state.t, plant.views.update(state))
 
 
 @pytest.mark.parametrize("observe", ["estimate", "oracle", "local"])
