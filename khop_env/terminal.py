@@ -203,6 +203,10 @@ def _print_guarantee(summary: Mapping[str, Any]) -> None:
         ratios += f"|g_tilde|/bound {_ratio(summary['max_error_to_bound_input'])}"
     if summary["funnel_kept"]:
         print_text(f"guarantee kept: largest {ratios} (all below 1)")
+        if cut_off := summary.get("cut_off"):
+            print_text(
+                f"no guarantee for {100.0 * cut_off:.3g} % of pairs and samples, cut off by links that were down"
+            )
         if summary["error"] is not None or summary.get("terminated"):
             how = "the episode stopped early" if summary["error"] is not None else "the task ended the episode"
             print_text(f"{how}, at t = {summary['duration']:.6g} s")

@@ -30,7 +30,8 @@ def paper_figure(recording: Recording, scenario: Scenario, path: str | Path, age
 
     (a) The agents' positions, from crosses (initial) to dots (final). (b) The largest |estimation error| and
     |disagreement| over all observers of one agent's state, with their bounds dashed. (c) The same for its input. Where
-    the bounds differ between components, (b) and (c) show the component with the largest ratio of error to bound.
+    the bounds differ between components, (b) and (c) show the component with the largest ratio of error to bound. Where
+    links come and go the bound is the largest of the observers' own, and interrupted while an observer is cut off.
 
     Over a network of messages (b) shows the estimate of one observer, as many links away as there are, within its
     certified bound, and (c) the largest error of the agent's position and the largest certified bound, of all observers
@@ -99,6 +100,8 @@ def _headline(recording: Recording, scenario: Scenario) -> str:
         return f"{scenario.name}: {kept}; largest |error| / bound = {_digits(largest)} over all {pairs} pairs"
     ratios = float(np.maximum(extremes.normalized, extremes.input_normalized)[0])  # nan if any is
     over = f"over all {recording.states.layout.pairs} pairs"
+    if isinstance(recording.states, ObserverRecord) and recording.states.cut_off.any():
+        over += ", while the target reaches the observer"
     if recording.error is not None:
         return f"{scenario.name}: stopped at t = {recording.time[-1]:.4g} s, {_reason(recording)}"
     kept = "inside all funnels" if ratios < 1.0 else "funnels left"
@@ -184,6 +187,8 @@ def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agen
     disagreement = np.abs(kind.disagreement[:, columns]).reshape(shape).max(axis=1)
     rho = kind.funnels.rho.evaluate(kind.time, np.empty((layout.rows, len(kind.time))))[rows].T
     delta = kind.funnels.delta.evaluate(kind.time, np.empty((layout.rows, len(kind.time))))[rows].T
+    if kind.up is not None:
+        delta = kind.bound[:, columns].reshape(shape).max(axis=1)
 
     names, units = (list(each) for each in zip(*recording.fleet.models[agent].states.items(), strict=True))
     if np.all(delta == delta[:, :1]):
@@ -195,14 +200,20 @@ def _draw_observers(axes: Axes, recording: Recording, kind: ObserverRecord, agen
         units = [units[worst]]
         error, disagreement, rho, delta = (values[:, worst] for values in (error, disagreement, rho, delta))
     letters = (r"\delta", r"\rho") if kind is recording.states else (r"\theta", r"\omega")
-    for values, bound, color, width, label, letter in (
-        (error, delta, _ERROR, 2.0, "|error|", letters[0]),  # wider: the two often coincide
-        (disagreement, rho, _DISAGREEMENT, 1.2, "|disagreement|", letters[1]),
+    of_error = f"its bound ${letters[0]}(t)$" if kind.up is None else "its bound, if any"
+    for values, bound, color, width, label, of_bound in (
+        (error, delta, _ERROR, 2.0, "|error|", of_error),  # wider: the two often coincide
+        (disagreement, rho, _DISAGREEMENT, 1.2, "|disagreement|", f"its bound ${letters[1]}(t)$"),
     ):
         axes.plot(kind.time, np.where(values > 0.0, values, np.nan), color=color, linewidth=width, label=f"max {label}")
-        axes.plot(kind.time, bound, color=color, linestyle=(0, (5, 2)), label=f"its bound ${letter}(t)$")
+        axes.plot(
+            kind.time, np.where(bound < np.inf, bound, np.nan), color=color, linestyle=(0, (5, 2)), label=of_bound
+        )
     axes.set_yscale("log")
     low, high = _lowest(error, disagreement, rho), float(delta.max())
+    if kind.up is not None:
+        highest = np.concatenate([delta, error, rho])
+        high = float(highest[np.isfinite(highest)].max())
     axes.set_ylim(low, high * (high / low) ** 0.2)  # room for the legend
     axes.set_xlim(0.0, float(kind.time[-1]) or 1.0)
     axes.set_xlabel("time (s)")

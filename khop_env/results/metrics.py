@@ -62,6 +62,9 @@ def summarize(
     the run reached its end with finite states. `diverged` indicates an unstable closed loop. Numbers that aren't finite
     are null.
 
+    Where links come and go there is one key more: `cut_off`, the share of pairs and samples at which the target didn't
+    reach its observer, so that there was no guarantee.
+
     Over a network of messages the certified bounds are what is guaranteed, and the disagreements are those that the
     estimator's agents compute from what they hold, null where it has none. There are further keys: `network` and
     `estimator`; `violations`, how many of the `pair_samples` (pairs and samples) have an error above the certified
@@ -112,7 +115,13 @@ def summarize(
             **{name: importlib.metadata.version(name) for name in ("numpy", "numba")},
         },
     }
-    return found | _of_network(observers, recording.fleet, states) if isinstance(states, MessageRecord) else found
+    if isinstance(states, MessageRecord):
+        return found | _of_network(observers, recording.fleet, states)
+    return (
+        found
+        if states.up is None
+        else found | {"cut_off": float(states.cut_off.mean()) if states.layout.pairs else 0.0}
+    )
 
 
 def _of_network(observers: Observers, fleet: Fleet, states: MessageRecord) -> dict[str, Any]:

@@ -68,10 +68,18 @@ class ObserverRecord:
         It is inf for observers that are cut off from their target.
         """
         if self.up is not None:
-            sums = WeightsNow(self.layout, len(self.time)).inverse_row_sums(np.ascontiguousarray(self.up.T))
-            return self.rho * sums[self.layout.column_pair].T
+            return self.rho * self._row_sums(self.up)[:, self.layout.column_pair]
         out = np.empty((self.layout.size, len(self.time)))
         return self.funnels.error_bounds(self._rows(self.funnels.delta), out).T
+
+    @property
+    def cut_off(self) -> NDArray[np.bool_]:
+        """(T, pairs) whether the target didn't reach the observer, so that nothing bounds the error."""
+        shape = len(self.time), self.layout.pairs
+        return np.zeros(shape, np.bool_) if self.up is None else np.isinf(self._row_sums(self.up))
+
+    def _row_sums(self, up: NDArray[np.bool_]) -> FloatArray:
+        return WeightsNow(self.layout, len(self.time)).inverse_row_sums(np.ascontiguousarray(up.T)).T
 
     def _evaluate(self, bank: FunnelBank) -> FloatArray:
         return self._rows(bank).T[:, self.layout.column_row]

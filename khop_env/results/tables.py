@@ -31,7 +31,8 @@ def estimates_table(recording: Recording) -> pl.DataFrame:
         disagreement: xi, or mu for inputs.
         rho: the funnel of the disagreement; omega for inputs.
         delta: the bound on the estimation error that was designed for; theta for inputs.
-        bound: this observer's own guaranteed bound on the error, at most delta (theta).
+        bound: this observer's own guaranteed bound on the error, at most delta (theta) while all links are up; inf
+            while the target doesn't reach it.
 
     Over a network of messages there are estimates of states only, of neighbours as well; disagreement, rho and delta
     are null, since they guarantee nothing there, bound is the certified one (inf where nothing is certified), and there
