@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +15,9 @@ from khop_env.brief import brief
 from khop_env.env.actuators import described
 from khop_env.env.layout import Float32Array
 from khop_env.env.settings import Settings
+from khop_env.network import Schedule
 from khop_env.observers import FloatArray, IntArray, Networked, Observers
-from khop_env.physics import Disturbance
+from khop_env.physics import Disturbance, Links
 from khop_env.simulation import SimulatorState
 from khop_env.tasks import Task, World
 
@@ -28,6 +31,8 @@ SHARED_INFOS = (
 observers of states and inputs since the last action, below 1 by guarantee; entries of this agent's observation and
 action that were clipped; bounds that are the largest value because there is none don't count. Under a network the
 bound is the certified one, neighbours' states included."""
+
+_LONGEST = 120  # characters of a graph in a message
 
 Infos = dict[str, NDArray[Any]]
 Step = tuple[Float32Array, FloatArray, NDArray[np.bool_], NDArray[np.bool_], Infos]
@@ -88,11 +93,27 @@ def signature(
         "control periods": (steps,),
         "networks": ("none" if networked is None else described(networked.network),),
         "estimators": () if networked is None else (networked.estimator.name,),
+        "schedules of links": () if design.schedule is None else tuple(map(_as_text, design.schedule.parts)),
         "disturbances": ("none" if disturbance is None else described(disturbance),),
         "bounds": tuple(bounds),
         "design rules": (design.states.rule,),
         "numbers of hops": (f"k = {design.k}",),
     }
+
+
+def _as_text(schedule: Schedule) -> str:
+    """Text that is the same for equal schedules; graphs as their links."""
+
+    def text(value: object) -> str:
+        if isinstance(value, nx.Graph):
+            links = str(sorted(Links.of(value).index))
+            return links if len(links) < _LONGEST else f"{len(Links.of(value))} links {zlib.crc32(links.encode()):08x}"
+        return f"({', '.join(map(text, value))})" if isinstance(value, tuple) else repr(value)
+
+    if not is_dataclass(schedule):
+        return type(schedule).__name__
+    values = (f"{field.name}={text(getattr(schedule, field.name))}" for field in fields(schedule))
+    return f"{type(schedule).__name__}({', '.join(values)})"
 
 
 def _only(first: tuple[str, ...], second: tuple[str, ...]) -> str:

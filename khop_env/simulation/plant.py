@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from khop_env.elementary import all_finite, weighted_sum
 from khop_env.observers import FloatArray, PlantState, SolveError
@@ -93,6 +94,25 @@ class FleetPlant:
     def effect(self, state: PlantState) -> None:
         """Write g(x, u) of the inputs in force."""
         self.fleet.input_map(self._t, self._bind(state), self._inputs, self._effects)
+
+    def checked_inputs(self, u: ArrayLike) -> FloatArray:
+        """Inputs (m,) or (B, m) that are to be held, checked.
+
+        Raises:
+            ValueError: where a law computes the inputs, and for a wrong shape or numbers that aren't finite.
+        """
+        if self.law is not None:
+            raise ValueError("this simulator has a law, which computes the inputs; build it with law=None to give u")
+        inputs = np.asarray(u, dtype=float)
+        if inputs.shape not in ((self.fleet.m,), (self.num_envs, self.fleet.m)):
+            raise ValueError(
+                f"u must have shape ({self.fleet.m},) or {(self.num_envs, self.fleet.m)}; got {inputs.shape}"
+            )
+        if not np.isfinite(inputs).all():
+            bad = np.flatnonzero(~np.isfinite(inputs.reshape(-1, self.fleet.m)).all(axis=0))
+            agent, name, unit = self.fleet.input_names()[bad[0]]
+            raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
+        return inputs
 
     def _bind(self, state: PlantState) -> FloatArray:
         """The states (B, n) as models see them; read-only views are made once, and again for another state's arrays."""

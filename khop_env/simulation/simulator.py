@@ -231,7 +231,7 @@ class Simulator:
             raise ValueError(f"dt must be positive and finite; got {dt!r}")
         parts = self.parts_of(dt)
         if u is not None:
-            self.state.u.T[...] = self._checked_inputs(u)
+            self.state.u.T[...] = self.plant.checked_inputs(u)
             self.plant.actuate(self.state)
         self.advance(float(dt), parts)
 
@@ -338,21 +338,6 @@ class Simulator:
         away = np.abs(states - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
         self.design.require_feasible_start(away, np.zeros(self.fleet.n))
         return states
-
-    def _checked_inputs(self, u: ArrayLike) -> FloatArray:
-        """Inputs of `step`, checked."""
-        if self.plant.law is not None:
-            raise ValueError("this simulator has a law, which computes the inputs; build it with law=None to give u")
-        inputs = np.asarray(u, dtype=float)
-        if inputs.shape not in ((self.fleet.m,), (self.num_envs, self.fleet.m)):
-            raise ValueError(
-                f"u must have shape ({self.fleet.m},) or {(self.num_envs, self.fleet.m)}; got {inputs.shape}"
-            )
-        if not np.isfinite(inputs).all():
-            bad = np.flatnonzero(~np.isfinite(inputs.reshape(-1, self.fleet.m)).all(axis=0))
-            agent, name, unit = self.fleet.input_names()[bad[0]]
-            raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
-        return inputs
 
     def _disagreement(self, funnels: Funnels, memory: str, source: FloatArray) -> FloatArray:
         links = None if self.design.schedule is None else LinksNow(self.design, self.num_envs)

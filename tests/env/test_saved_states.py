@@ -6,6 +6,7 @@ import pytest
 
 from khop_env import consensus_v0, scenario
 from khop_env.env import Lag
+from khop_env.network import Fixed, Outage, RandomLinks
 from khop_env.observers import Exponential
 from khop_env.physics import Sinusoid
 from tests.env.playing import batched, parallel, play, same, state
@@ -112,6 +113,17 @@ def star(k):
             r"bounds differ: .* there, Exponential\(.*rate=4.0\) here",
         ),
         (
+            paper_with(schedule=RandomLinks(0.5)),
+            paper_with(schedule=RandomLinks(0.6)),
+            r"schedules of links differ: RandomLinks\(probability=0.5, .*\) there, RandomLinks\(probability=0.6, .*here",
+        ),
+        (
+            paper_with(schedule=Fixed(nx.path_graph(3))),
+            paper_with(schedule=Fixed(nx.path_graph(2)) & Outage(1.0, 1.0)),
+            r"schedules of links differ: Fixed\(graph=\[\(0, 1\), \(1, 0\), \(1, 2\), \(2, 1\)\]\) there, "
+            r"Fixed\(graph=\[\(0, 1\), \(1, 0\)\]\), Outage\(.*\) here",
+        ),
+        (
             star(2),
             star(3),
             "numbers of hops differ: k = 2 there, k = 3 here; make both with the same arguments",
@@ -180,3 +192,12 @@ def test_a_restored_environment_can_be_rendered():
     env.reset(seed=3)
     fresh.set_state(env.get_state())
     np.testing.assert_array_equal(fresh.render(), env.render())
+
+
+def test_schedules_are_known_by_their_links():
+    """Not by the objects that hold them, and not by their order."""
+    there, here = nx.Graph([(0, 1), (1, 2), (5, 4)]), nx.Graph([(4, 5), (2, 1), (1, 0)])
+    env, other = (consensus_v0.parallel_env(**paper_with(schedule=Fixed(graph))) for graph in (there, here))
+    env.reset(seed=1)
+    other.set_state(env.get_state())
+    assert same(play(other, 2), play(env, 2))
