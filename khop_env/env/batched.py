@@ -19,7 +19,8 @@ from khop_env.env.readout import Sources, summarize
 from khop_env.env.settings import Settings
 from khop_env.env.state import EnvState, Infos, Step, signature
 from khop_env.observers import FloatArray, IntArray
-from khop_env.simulation import ReceivedStates, Simulator, links_up
+from khop_env.simulation import Simulator
+from khop_env.simulation.received import ReceivedStates, links_up
 from khop_env.tasks import Outcome, Task, World
 
 

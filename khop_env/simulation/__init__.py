@@ -2,7 +2,6 @@
 
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant
-from khop_env.simulation.received import ReceivedStates, links_up
 from khop_env.simulation.simulator import Simulator
 from khop_env.simulation.state import SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, View, ViewBuilder
@@ -13,10 +12,8 @@ __all__ = [
     "InitialSet",
     "Law",
     "Observe",
-    "ReceivedStates",
     "Simulator",
     "SimulatorState",
     "View",
     "ViewBuilder",
-    "links_up",
 ]

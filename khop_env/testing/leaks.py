@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from khop_env.env import EnvState, KHopEnv
 from khop_env.observers import IntArray, Networked, PairLayout
-from khop_env.simulation import links_up
+from khop_env.simulation.received import links_up
 from khop_env.testing.equality import difference
 from khop_env.testing.subject import Fault, Subject, called, play
 from khop_env.testing.views import copies
