@@ -201,9 +201,9 @@ def _relay_against_ppso(rows: Iterable[NetworkRow]) -> str:
     if not both:
         return ""
     return (
-        f"why not just pass states on? At the same times of messages, which are {_between(longer)} times as long, the "
-        f"mean error of the paper's observers (ppso) is {_between(errors)} times that of states passed on and "
-        f"predicted (relay), and their certified bound {_between(bounds)} times"
+        f"why not just pass states on? At the same message rate the mean error of the paper's observers (ppso) is "
+        f"{_between(errors)} times that of states passed on and predicted (relay), their certified bound "
+        f"{_between(bounds)} times, and their messages are {_between(longer)} times as long"
     )
 
 
