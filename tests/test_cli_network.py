@@ -46,7 +46,7 @@ class TestNetwork:
         text = " ".join(found.split())
         assert "paper under tanh on estimates, 2 episodes, the same for every row" in text
         assert (
-            "why not just pass states on? At the same times of messages, which are 1.9 times as long, the mean error"
+            "why not just pass states on? At the same message rate the mean error of the paper's observers (ppso) is"
             in text
         )
         assert "errors above their certified bounds, start included: 0 of" in text
