@@ -122,18 +122,22 @@ def test_without_any_message_slots_hold_the_first_guess():
 
 
 def test_ages_and_bounds_that_are_too_large_are_clipped_and_counted():
-    """A bound of inf, of a model that declares nothing, is the largest of its field."""
+    """A bound of inf, of a model that declares nothing, is the largest of its field; nothing is clipped there."""
     env = parallel("consensus_v0", network=SILENT, bounds=True, limit=0.2)
     env.reset(seed=2)
     play(env, 6)
     values = env.layout("drifter_0").read(env.observe("drifter_0"))
     assert values["slot0.age"] == np.float32(0.2)
-    env.batched.simulator.state.memory["bound"][...] = np.inf
     layout = env.layout("drifter_0")
-    observations, counts = env.batched._observe()
-    high = layout.high[layout.columns("slot0.bound")]
-    np.testing.assert_array_equal(observations[0, 0, layout.columns("slot0.bound")], high)
-    assert counts[0, 0] >= 3 * len(layout.slots)
+    high, counted = layout.high[layout.columns("slot0.bound")], []
+    for bound in (0.0, np.inf, 1e6):
+        env.batched.simulator.state.memory["bound"][...] = bound
+        observations, counts = env.batched._observe()
+        shown = observations[0, 0, layout.columns("slot0.bound")]
+        np.testing.assert_array_equal(shown, high if bound else np.zeros(2))
+        counted.append(int(counts[0, 0]))
+    assert counted[0] >= len(layout.slots)
+    assert counted == [counted[0], counted[0], counted[0] + 2 * len(layout.slots)]
 
 
 def test_exchange_without_a_network_has_no_ages():
