@@ -8,9 +8,7 @@ from khop_env.observers.base import (
     Assumptions,
     Certified,
     Extremes,
-    FunnelObservers,
     Information,
-    LinksNow,
     Memory,
     Observers,
     Plant,
@@ -30,6 +28,7 @@ from khop_env.observers.design import (
 )
 from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
+from khop_env.observers.funnel_observers import FunnelObservers, LinksNow
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
 from khop_env.observers.messages import MessagePassing
 from khop_env.observers.networked import ESTIMATORS, Networked, as_estimator

@@ -7,9 +7,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from khop_env.observers.base import Assumptions, FunnelObservers, LinksNow, Plant, PlantState, weights_at
+from khop_env.observers.base import Assumptions, Plant, PlantState
 from khop_env.observers.design import Funnels, ObserverDesign
 from khop_env.observers.disagreement import correction, disagreement_by, largest_curvature
+from khop_env.observers.funnel_observers import FunnelObservers, LinksNow, weights_at
 from khop_env.observers.layout import FloatArray
 from khop_env.observers.prediction import Prediction
 from khop_env.observers.weights import Weights

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from khop_env.observers.base import LinksNow, PlantState
+from khop_env.observers.base import PlantState
 from khop_env.observers.design import Funnels, ObserverDesign
 from khop_env.observers.explicit import Derivative
+from khop_env.observers.funnel_observers import LinksNow
 from khop_env.observers.layout import FloatArray
 from khop_env.observers.performance import PerformanceFunction
 from khop_env.physics import AgentModel

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from khop_env.elementary import weighted_sum
-from khop_env.observers.base import Assumptions, FunnelObservers, Memory, Plant, PlantState, SolveError, weights_at
+from khop_env.observers.base import Assumptions, Memory, Plant, PlantState, SolveError
 from khop_env.observers.design import Funnels, ObserverDesign
+from khop_env.observers.funnel_observers import FunnelObservers, weights_at
 from khop_env.observers.layout import FloatArray
 from khop_env.observers.prediction import Prediction
 from khop_env.observers.solve import MAX_ITERATIONS

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.network import Network
-from khop_env.observers.base import Extremes, Memory, PlantState, WidthsNow
+from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.estimators import Take
+from khop_env.observers.funnel_observers import WidthsNow
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 from khop_env.observers.prediction import Prediction
 from khop_env.observers.scalar import solve_alone

@@ -25,8 +25,8 @@ from khop_env.observers import (
     Proximal,
     SolveError,
 )
-from khop_env.observers.base import LinksNow, weights_at
 from khop_env.observers.disagreement import disagreement_by
+from khop_env.observers.funnel_observers import LinksNow, weights_at
 from khop_env.physics import read_only
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step

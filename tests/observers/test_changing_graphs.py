@@ -21,7 +21,7 @@ from khop_env.observers import (
     ObserverDesign,
     Proximal,
 )
-from khop_env.observers.base import LinksNow
+from khop_env.observers.funnel_observers import LinksNow
 from khop_env.physics import Fleet, SingleIntegrator, SurfaceVessel
 from khop_env.registry import scenario
 from khop_env.results import design_report
