@@ -17,7 +17,7 @@ def test_the_readmes_python_runs(capsys, tmp_path, monkeypatch):
         snippet = snippet.replace("learn(1_000_000)", "learn(10_000)")  # 20 s of training are too long here
         exec(compile(snippet, "README.md", "exec"), {})
         said.append(capsys.readouterr().out)
-    assert len(snippets) == 6
+    assert len(snippets) == 7
     assert all(said)
     assert "largest |xi| / rho: 0." in said[-1]
 
