@@ -16,6 +16,7 @@ import networkx as nx
 import numpy as np
 
 from khop_env.network.activity import Activity, Drawn, Masked, Near, Off, Part, Switched
+from khop_env.network.checks import bounds_of, graph_of, is_index, mask_of, positive, require_bools, require_graph
 from khop_env.network.reading import Span, number, number_or_range
 from khop_env.physics import IndexArray, Links, did_you_mean
 
@@ -114,11 +115,13 @@ class Fixed(Schedule):
 
     def __post_init__(self) -> None:
         if self.graph is not None:
-            _require_graph(self.graph, "Fixed.graph")
+            require_graph(self.graph, "Fixed.graph")
 
     def part(self, links: Links, positions: IndexArray, number: int) -> Part:
         """See `Schedule.part`."""
-        return Masked(np.ones(len(links), np.bool_) if self.graph is None else _mask(links, self.graph, "Fixed.graph"))
+        return Masked(
+            np.ones(len(links), np.bool_) if self.graph is None else mask_of(links, self.graph, "Fixed.graph")
+        )
 
 
 @dataclass(frozen=True)
@@ -144,11 +147,11 @@ class Switching(Schedule):
         if not graphs:
             raise ValueError(f"Switching.graphs must be graphs, at least one; got {self.graphs!r}")
         for i, graph in enumerate(graphs):
-            _require_graph(graph, f"Switching.graphs[{i}]")
+            require_graph(graph, f"Switching.graphs[{i}]")
         object.__setattr__(self, "graphs", graphs)
         period = self.period
         if period is not None:
-            period = _positive(period, "Switching.period", "s")
+            period = positive(period, "Switching.period", "s")
             object.__setattr__(self, "period", period)
         if self.times is None and period is None:
             raise ValueError("Switching: give the period of a cycle, or the times at which each graph begins")
@@ -166,7 +169,7 @@ class Switching(Schedule):
 
     def part(self, links: Links, positions: IndexArray, number: int) -> Part:
         """See `Schedule.part`."""
-        masks = [_mask(links, graph, f"Switching.graphs[{i}]") for i, graph in enumerate(self.graphs)]
+        masks = [mask_of(links, graph, f"Switching.graphs[{i}]") for i, graph in enumerate(self.graphs)]
         return Switched(np.array(self.times, float), self.period or 0.0, np.array(masks))
 
 
@@ -189,9 +192,9 @@ class RandomLinks(Schedule):
     connected: bool = False
 
     def __post_init__(self) -> None:
-        _require_bools(self, "both_ways", "connected")
+        require_bools(self, "both_ways", "connected")
         value = number_or_range(self.probability, "RandomLinks.probability")
-        low, high = _bounds(value)
+        low, high = bounds_of(value)
         if not 0.0 <= low <= high <= 1.0:
             raise ValueError(f"RandomLinks.probability must be from 0 to 1; got {self.probability!r}")
         object.__setattr__(self, "probability", value)
@@ -205,7 +208,7 @@ class RandomLinks(Schedule):
                 "RandomLinks.connected: the communication graph has links that go one way, out of which no connected "
                 "graph can be drawn edge by edge; set connected = False"
             )
-        low, high = _bounds(self.probability)
+        low, high = bounds_of(self.probability)
         return Drawn(links, number, low, high - low, self.both_ways, self.connected)
 
 
@@ -223,7 +226,7 @@ class Range(Schedule):
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", _positive(self.radius, "Range.radius", "m"))
+        object.__setattr__(self, "radius", positive(self.radius, "Range.radius", "m"))
 
     def part(self, links: Links, positions: IndexArray, number: int) -> Part:
         """See `Schedule.part`."""
@@ -252,15 +255,15 @@ class Outage(Schedule):
     def __post_init__(self) -> None:
         for name in ("start", "duration"):
             value = number_or_range(getattr(self, name), f"Outage.{name}")
-            if not (_bounds(value)[0] >= 0.0 and math.isfinite(_bounds(value)[1])):
+            if not (bounds_of(value)[0] >= 0.0 and math.isfinite(bounds_of(value)[1])):
                 raise ValueError(f"Outage.{name} must be finite and not negative, in s; got {getattr(self, name)!r}")
             object.__setattr__(self, name, value)
         if self.agent is not None and self.link is not None:
             raise ValueError("Outage: give an agent or a link, not both; `&` joins two outages")
-        if self.agent is not None and not _is_index(self.agent):
+        if self.agent is not None and not is_index(self.agent):
             raise ValueError(f"Outage.agent must be an agent's index; got {self.agent!r}")
         if self.link is not None:
-            if not isinstance(self.link, Sequence) or len(self.link) != 2 or not all(map(_is_index, self.link)):
+            if not isinstance(self.link, Sequence) or len(self.link) != 2 or not all(map(is_index, self.link)):
                 raise ValueError(f"Outage.link must be two agents (sender, receiver); got {self.link!r}")
             object.__setattr__(self, "link", (int(self.link[0]), int(self.link[1])))
 
@@ -271,7 +274,7 @@ class Outage(Schedule):
         if self.link is not None and self.link not in links.index:
             sender, receiver = self.link
             raise ValueError(f"Outage.link: the communication graph has no link from {sender} to {receiver}")
-        (early, late), (short, long) = _bounds(self.start), _bounds(self.duration)
+        (early, late), (short, long) = bounds_of(self.start), bounds_of(self.duration)
         link = -1 if self.link is None else links.index[self.link]
         agent = -1 if self.agent is None else self.agent
         return Off(links, number, (early, late - early), (short, long - short), agent, link)
@@ -302,77 +305,15 @@ def from_table(table: Mapping[str, object]) -> Schedule:
         if key not in known:
             raise ValueError(f"{make.__name__}: unknown key {key!r}; {did_you_mean(key, known)}")
     if "graph" in values:
-        values["graph"] = _graph(values["graph"], directed, f"{make.__name__}.graph")
+        values["graph"] = graph_of(values["graph"], directed, f"{make.__name__}.graph")
     if "graphs" in values:
         listed = values["graphs"]
         if not isinstance(listed, Sequence) or isinstance(listed, str):
             raise ValueError(f"{make.__name__}.graphs must be a list of lists of edges; got {listed!r}")
         name = f"{make.__name__}.graphs"
-        values["graphs"] = tuple(_graph(edges, directed, f"{name}[{i}]") for i, edges in enumerate(listed))
+        values["graphs"] = tuple(graph_of(edges, directed, f"{name}[{i}]") for i, edges in enumerate(listed))
     try:
         return make(**values)
     except TypeError:
         missing = [field.name for field in fields(make) if field.name not in values and field.default is MISSING]
         raise ValueError(f"{make.__name__}: {missing[0]} is missing") from None
-
-
-def _graph(edges: object, directed: bool, what: str) -> nx.Graph:
-    """A graph from a list of edges, which it keeps as it is if it is a graph already."""
-    if isinstance(edges, nx.Graph):
-        return edges
-    if not isinstance(edges, Sequence) or not all(
-        isinstance(edge, Sequence) and len(edge) == 2 and all(map(_is_index, edge)) for edge in edges
-    ):
-        raise ValueError(f"{what} must be a list of edges [i, j] between agents' indices; got {edges!r}")
-    graph = nx.DiGraph() if directed else nx.Graph()
-    graph.add_edges_from(tuple(edge) for edge in edges)
-    return graph
-
-
-def _mask(links: Links, graph: nx.Graph, what: str) -> np.ndarray:
-    """(L,) the links of a graph among all.
-
-    Raises:
-        ValueError: naming those that the communication graph doesn't have.
-    """
-    edges = list(graph.edges)
-    if not graph.is_directed():
-        edges += [(j, i) for i, j in edges]
-    absent = sorted(edge for edge in edges if edge not in links.index)
-    if absent:
-        raise ValueError(
-            f"{what} has {len(absent)} links that the communication graph doesn't have, the first from {absent[0][0]} "
-            f"to {absent[0][1]}; the communication graph has all links that may ever be up: add them to it"
-        )
-    mask = np.zeros(len(links), np.bool_)
-    mask[[links.index[edge] for edge in edges]] = True
-    return mask
-
-
-def _require_graph(graph: object, what: str) -> None:
-    if not isinstance(graph, nx.Graph) or graph.is_multigraph():
-        raise ValueError(f"{what} must be a networkx.Graph or DiGraph of agents' indices; got {graph!r}")
-    wrong = [node for node in graph if not _is_index(node)]
-    if wrong:
-        raise ValueError(f"{what}: nodes must be agents' indices; got {wrong[0]!r}")
-
-
-def _require_bools(schedule: Schedule, *names: str) -> None:
-    for name in names:
-        if not isinstance(getattr(schedule, name), bool | np.bool):
-            raise ValueError(f"{type(schedule).__name__}.{name} must be True or False; got {getattr(schedule, name)!r}")
-
-
-def _positive(value: object, what: str, unit: str) -> float:
-    found = number(value, what)
-    if not 0.0 < found < math.inf:
-        raise ValueError(f"{what} must be positive and finite, in {unit}; got {value!r}")
-    return found
-
-
-def _is_index(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
-
-
-def _bounds(value: Span) -> tuple[float, float]:
-    return value if isinstance(value, tuple) else (value, value)

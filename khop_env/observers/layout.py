@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.brief import brief
+from khop_env.observers.ordering import profile_order
 from khop_env.physics import Links
 
 IntArray = NDArray[np.int64]
@@ -149,7 +150,7 @@ class PairLayout:
         relay_link: list[int] = []
         size = rows = 0
         for i in range(links.agents) if targets is None else sorted(targets):
-            members = _profile_order(senders, neighborhoods[i])
+            members = profile_order(senders, neighborhoods[i])
             if not members:
                 continue
             place = {agent: a for a, agent in enumerate(members)}
@@ -331,24 +332,3 @@ class PairLayout:
 def _joined(parts: Iterable[IntArray]) -> IntArray:
     """The parts after each other; an empty array of none."""
     return np.concatenate([np.zeros(0, np.int64), *parts])
-
-
-def _profile_order(adjacency: Sequence[frozenset[int]], members: Sequence[int]) -> list[int]:
-    """Order observers by reversed breadth-first search within their own graph: little fill-in when M_i is factorised.
-
-    Source: E. Cuthill and J. McKee, Reducing the bandwidth of sparse symmetric matrices, 1969.
-    """
-    inside = set(members)
-    degree = {agent: len(adjacency[agent] & inside) for agent in members}
-    order: list[int] = []
-    for root in sorted(members, key=lambda agent: (degree[agent], agent)):
-        if root not in inside:
-            continue
-        inside.discard(root)
-        queue = [root]
-        for agent in queue:
-            fresh = sorted(adjacency[agent] & inside, key=lambda other: (degree[other], other))
-            inside.difference_update(fresh)
-            queue.extend(fresh)
-        order.extend(queue)
-    return order[::-1]
