@@ -29,9 +29,10 @@ from khop_env.observers.design import (
 from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
 from khop_env.observers.funnel_observers import FunnelObservers, LinksNow
+from khop_env.observers.known_estimators import ESTIMATORS, as_estimator
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
 from khop_env.observers.messages import MessagePassing
-from khop_env.observers.networked import ESTIMATORS, Networked, as_estimator
+from khop_env.observers.networked import Networked
 from khop_env.observers.node import Estimate, ObserverNode
 from khop_env.observers.performance import Exponential, FunnelBank, PerformanceFunction, lower_bound
 from khop_env.observers.proximal import Proximal

@@ -38,6 +38,7 @@ class Certificate:
     Attributes:
         growth: as the model declares it, None if it doesn't.
         rate: (n,) bound on |g| + |w|, in state units per second.
+        longest_step: longest Euler step in s of a sampled system that is certified (docs, "Sampled systems").
         reason: why nothing is certified; "" for a certificate that bounds every component.
 
     Raises:
@@ -59,8 +60,9 @@ class Certificate:
         self.rate = rate = model.checked_input_map_bound() + disturbance
         self.reason = _reason(model, self.growth, rate, self.start)
         self._table = None
+        self.longest_step = math.inf
         if self.growth is not None:
-            refuse_too_small(model, self.growth)
+            self.longest_step = _longest_step(model, self.growth, refuse_too_small(model, self.growth))
             self._table = RadiusTable(self.growth, rate, self.start)
 
     @property
@@ -102,8 +104,11 @@ class Certificate:
         return box.intersect(Box(-region, region))
 
 
-def refuse_too_small(model: AgentModel, growth: Growth) -> None:
+def refuse_too_small(model: AgentModel, growth: Growth) -> float:
     """Compare a declared growth with finite differences of the drift at random states and times.
+
+    Returns:
+        The fastest decay -df_j/dx_j that was seen, in 1/s, at least 0.
 
     Raises:
         ValueError: naming the entry that is exceeded.
@@ -111,7 +116,7 @@ def refuse_too_small(model: AgentModel, growth: Growth) -> None:
     rng, n = np.random.default_rng(0), model.n
     if growth.matrix.shape != (n, n):
         raise ValueError(f"{_name(model)}.drift_growth: matrix {growth.matrix.shape} for {n} states; expected {(n, n)}")
-    reach = np.where(np.isfinite(growth.region), 0.999 * growth.region, 3.0)
+    reach, fastest = np.where(np.isfinite(growth.region), 0.999 * growth.region, 3.0), 0.0
     x, t = reach * rng.uniform(-1.0, 1.0, (_PROBES, n)), rng.uniform(0.0, 100.0, _PROBES)
     names = list(model.states)
     for state in range(n):
@@ -120,6 +125,7 @@ def refuse_too_small(model: AgentModel, growth: Growth) -> None:
         ahead[:, state] += step
         behind[:, state] -= step
         slope = (model.drift(t, ahead) - model.drift(t, behind)) / (2.0 * step)
+        fastest = max(fastest, -float(slope[:, state].min()))
         seen = np.where(np.arange(n) == state, slope, np.abs(slope)).max(axis=0)
         declared = growth.matrix[:, state]
         for row in np.flatnonzero(seen > declared + 1e-6 * (np.abs(declared) + np.abs(seen).max()))[:1]:
@@ -133,6 +139,17 @@ def refuse_too_small(model: AgentModel, growth: Growth) -> None:
             f"{_name(model)}.drift_growth: spread = {growth.spread[row]:g} for {names[row]!r}, but its rates "
             f"at some two states differ by {seen[row]:.6g}; declare a bound on that, or np.inf"
         )
+    return fastest
+
+
+def _longest_step(model: AgentModel, growth: Growth, seen: float) -> float:
+    """1 over the fastest decay -df_j/dx_j of a drift: as declared, at most its Lipschitz constant, at least as seen.
+
+    `Growth.step` is 1/16 over the largest rate; half of 1 over that is kept.
+    """
+    lipschitz = float(model.drift_lipschitz())
+    fastest = max(seen, float(-np.diag(growth.matrix).min(initial=0.0)), lipschitz if math.isfinite(lipschitz) else 0.0)
+    return min(8.0 * growth.step, 1.0 / fastest if fastest > 0.0 else math.inf)
 
 
 def _reason(model: AgentModel, growth: Growth | None, rate: FloatArray, start: FloatArray) -> str:

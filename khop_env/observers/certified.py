@@ -49,6 +49,6 @@ def report(
                 radius = _UP * r[q, b]
                 low, high = max(p[q, b] - radius, -limit), min(p[q, b] + radius, limit)
                 value = proposed[own + c, b] if own >= 0 else 0.5 * (low + high)
-                value = min(max(value, low), high)
+                value = min(max(value, low), high) if value == value else min(max(p[q, b], low), high)
                 estimate[q, b] = value
                 bound[q, b] = max(value - low, high - value)

@@ -75,6 +75,7 @@ def merge(
     newest: NDArray[np.int64],
     heard: NDArray[np.bool_],
     noise: float,
+    even_since: FloatArray,
     t: FloatArray,
     now: FloatArray,
     center: FloatArray,
@@ -94,6 +95,8 @@ def merge(
         newest: (L, B) round in which each link's newest message was sent.
         heard: (L, B) whether it has just arrived.
         noise: certified error of a state that its agent itself sends.
+        even_since: (B,) since when steps are equal, in s. What has been on its way since before then isn't used: it
+            can't be moved in the steps of the plant.
         t: (B,) time that predictions are of, in s.
         now: (B,) the round's time, in s.
         center: (P, B) predictions; changed.
@@ -113,7 +116,9 @@ def merge(
     for over in range(newest.shape[0]):
         for b in range(batch):
             arrives = heard[over, b] and (newest[over, b] < number[b]) == late
-            place[over, b] = newest[over, b] % capacity if arrives else -1
+            at = newest[over, b] % capacity
+            usable = arrives and sent[at, TIME, b] >= even_since[b] - 1e-12
+            place[over, b] = at if usable else -1
     behind = False
     for pair in range(column.size):
         for b in range(batch):
@@ -158,5 +163,6 @@ def largest_share(
         row = column_source[q]
         for b in range(largest.size):
             error = abs(estimate[q, b] - x[row, b])
-            if not error <= largest[b] * bound[q, b]:  # a NaN is reported as such
-                largest[b] = error / bound[q, b]
+            share = error / bound[q, b] if error > 0.0 else 0.0 * error  # a NaN stays, and is reported
+            if not share <= largest[b] and largest[b] == largest[b]:
+                largest[b] = share

@@ -21,17 +21,14 @@ from khop_env.observers.base import Assumptions, Certified, Extremes, Informatio
 from khop_env.observers.certificate import Certificate
 from khop_env.observers.certified import report
 from khop_env.observers.design import ObserverDesign
-from khop_env.observers.estimators import Estimator, Relay
+from khop_env.observers.estimators import Estimator
+from khop_env.observers.known_estimators import as_estimator, require_memory
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, largest_share, merge
 from khop_env.observers.reckoning import Reckoning
-from khop_env.observers.rounds import Rounds
-from khop_env.physics import AgentModel, did_you_mean, hops_from_targets
+from khop_env.physics import AgentModel, hops_from_targets
 
 _CHANNEL = "channel."
-
-ESTIMATORS: Mapping[str, type[Estimator]] = {"ppso": Rounds, "relay": Relay}
-"""Estimators by name."""
 
 
 class Networked:
@@ -39,7 +36,8 @@ class Networked:
 
     The plant moves by explicit Euler steps, as with `Proximal(order=1)`, and a law's inputs are kept within the models'
     limits, on which the certificates rest. Rounds take place at the first grid point at or after each multiple of the
-    network's period.
+    network's period. Equal steps are usual: a message counts as lost if steps of another length have begun while it was
+    on its way, for longer than one step.
 
     Args:
         network: how often agents send, and what becomes of messages; anything that `Network.of` reads.
@@ -85,12 +83,12 @@ class Networked:
         self.estimator = copy.copy(self.estimator)  # its buffers are this object's own
         shared = 1 + fleet.n + 2 * (layout.size + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
+        require_memory(self.estimator, sources.components)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
         self._activity = None if design.schedule is None else design.activity()
         self._up = np.ones((len(design.links), num_envs), np.bool_)
         self._of_memory = [(name, _CHANNEL + name) for name in self.channel.allocate()]
         self._lag = np.zeros((layout.pairs, num_envs))
-        self._dt = self.longest_step
         self._fastest = self._fewest_rounds()
 
     def allocate(self) -> Memory:
@@ -106,6 +104,8 @@ class Networked:
             "stamp": np.zeros((pairs, batch)),
             "hops": np.zeros((pairs, batch)),
             "arrived": np.zeros((pairs, batch)),
+            "step": np.zeros(batch),
+            "even_since": np.zeros(batch),
             **self.estimator.allocate(),
             **channel,
         }
@@ -119,7 +119,8 @@ class Networked:
         memory["error"][:, env_ids] = self._assumed.radius[self.layout.column_source][:, None]
         for name in ("stamp", "arrived"):
             memory[name][:, env_ids] = -1.0
-        memory["hops"][:, env_ids] = memory["input_estimate"][:, env_ids] = 0.0
+        for name in ("hops", "input_estimate", "step", "even_since"):
+            memory[name][..., env_ids] = 0.0
         self.channel.reset(self._of_channel(memory), env_ids, rngs)
         heard = memory[_CHANNEL + "heard"].copy()
         self.estimator.reset(memory, env_ids, first_guess)
@@ -142,13 +143,14 @@ class Networked:
         due = self.channel.due(self._of_channel(memory), state.t)
         self._begin_round(state, due)
         rounds = bool(due.any())
+        changed = np.abs(memory["step"] - dt) > 1e-9 * dt
+        np.copyto(memory["even_since"], before.t, where=changed)
+        memory["step"].fill(dt)
         if rounds and self.network.most_rounds_late:
-            self._merge(
-                True, state, before.t, dt
-            )  # as if they had arrived at the last grid point, and moved from there
+            # as if these messages had arrived at the last grid point, and what they say had been moved from there
+            self._merge(True, state, before.t, dt)
         self.estimator.predict(memory, before.t, dt)
         self._reckoning.advance(memory["center"], memory["error"], before.t, dt)
-        self._dt = dt
         if rounds:
             self._send(state, due)
         self._report(state)
@@ -180,7 +182,7 @@ class Networked:
         Returns:
             `out` (P, B), written.
         """
-        h, period = self._dt, self.network.period
+        h, period = float(state.memory["step"].max()) or self.longest_step, self.network.period
         round_ = self._of_channel(state.memory)["round"]
         rounds = self._fastest[:, None]
         since = np.maximum(state.t - round_ * period, 0.0)
@@ -216,9 +218,15 @@ class Networked:
         memory, channel = state.memory, self._of_channel(state.memory)
         shared = [state.t[None], self._measured]
         shared += [memory[name] for name in ("center", "error", "stamp", "hops")]
-        self.channel.send(channel, [*shared, *self.estimator.message(state)], due)
+        added = self.estimator.message(state)
+        if sum(map(len, added)) != self.estimator.width:
+            raise ValueError(
+                f"estimator {self.estimator.name!r}: message() has {sum(map(len, added))} rows, its width is "
+                f"{self.estimator.width}"
+            )
+        self.channel.send(channel, [*shared, *added], due)
         if not self.network.fewest_rounds_late:
-            self._merge(False, state, state.t, self._dt)
+            self._merge(False, state, state.t, 1.0)  # nothing has to be moved
 
         def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
             self.channel.receive(channel, link, row, held)
@@ -236,6 +244,7 @@ class Networked:
             channel["newest"],
             channel["heard"],
             self.network.noise,
+            memory["even_since"],
             t,
             state.t,
             memory["center"],
@@ -270,25 +279,6 @@ class Networked:
         )
         late = self.network.fewest_rounds_late
         return distance * late if late else distance - 1.0
-
-
-def as_estimator(estimator: str | Estimator) -> Estimator:
-    """An estimator by name, or a copy of an object.
-
-    Raises:
-        ValueError: for an unknown name, or an object that isn't an estimator.
-    """
-    if isinstance(estimator, str):
-        if estimator not in ESTIMATORS:
-            raise ValueError(f"no estimator {estimator!r}; {did_you_mean(estimator, ESTIMATORS)}")
-        return ESTIMATORS[estimator]()
-    missing = [name for name in ("name", "prepare", "message", "receive") if not hasattr(estimator, name)]
-    if missing:
-        raise ValueError(
-            f"an estimator is a name ({', '.join(ESTIMATORS)}) or an Estimator; got {estimator!r}, which has no "
-            f"{missing[0]}"
-        )
-    return copy.copy(estimator)
 
 
 def missed_rounds(observers: Observers, state: PlantState) -> FloatArray:

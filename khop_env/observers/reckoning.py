@@ -5,7 +5,7 @@ prediction p+ = p + h f(p) parts from it by at most r, component by component:
 
     r+ = min((I + h Lambda) r, r + h spread) + h (g_bar + w_bar)
 
-wherever h |df_j/dx_j| <= 1, which `longest_step` keeps (docs/theory_certificates.md, "Sampled systems").
+wherever -h df_j/dx_j <= 1, which `longest_step` keeps (docs/theory_certificates.md, "Sampled systems").
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 from khop_env.physics import AgentModel, read_only
 
 _ROUNDING = 1e-15  # of a state, per step
-_STEPS = 8.0  # of `Growth.step`, which is 1/16 over the largest rate: h |df/dx| <= 1/2
 
 
 class _Run(NamedTuple):
@@ -50,7 +49,7 @@ class Reckoning:
     def __init__(self, layout: PairLayout, certificates: Sequence[Certificate], num_envs: int) -> None:
         self._num_envs, self._layout = num_envs, layout
         growths = [certificates[i].growth for i in layout.target.tolist()]
-        self.longest_step = min((_STEPS * growth.step for growth in growths if growth is not None), default=math.inf)
+        self.longest_step = min((certificates[i].longest_step for i in layout.target.tolist()), default=math.inf)
         self._runs: list[_Run] = []
         last: tuple[AgentModel, bytes] | None = None
         matrices: list[FloatArray] = []

@@ -21,7 +21,6 @@ from khop_env.observers.radius import RadiusTable, exponential
 from khop_env.physics import AgentModel, Growth
 
 _MOST_INTERVALS = 100_000
-LONGEST_SAMPLED = 8.0  # of `Growth.step`: h |df/dx| is at most 1/2
 
 
 class Estimate(NamedTuple):
@@ -105,10 +104,10 @@ class RemoteAgent:
         growth = self._growth = self._known.growth
         # in a sampled system, radii after 0, 1, ... steps: of the initial set, and of what has arrived
         self._in_steps = [[radius], [noise]] if sampled else None
-        if sampled and growth is not None and step > LONGEST_SAMPLED * growth.step * (1.0 + 1e-9):
+        if sampled and step > self._known.longest_step * (1.0 + 1e-9):
             raise ValueError(
                 f"sampled systems with {type(model).__name__} need steps of at most "
-                f"{LONGEST_SAMPLED * growth.step:.4g} s, or nothing is certain of them; got {step:g}"
+                f"{self._known.longest_step:.4g} s, or nothing is certain of them; got {step:g}"
             )
         self._drift, self.reason = extended_drift(model, growth), self._known.reason
         self._rounding = None

@@ -27,8 +27,9 @@ class Growth:
         spread: (n,) largest |f_j(x) - f_j(p)| of any two states, in state units per second; inf by default.
         region: (n,) largest |x_j| for which all this holds; inf, the default, for all states. Where it is finite, f is
             taken to go on outside with the slope Lambda_jj along x_j, and with no slope along others (`extended`).
-        step: longest step in s in which a Runge-Kutta method of order 4 follows the drift well: about 1 / 16 over its
-            largest rate.
+        step: 1 / 16 over the drift's largest rate |df_j/dx_l|, in s: the longest step in which a Runge-Kutta method of
+            order 4 follows it well, and an eighth of the longest in which an Euler step is certified. The default inf
+            is for drifts whose `drift_lipschitz` is finite, or that don't decay.
 
     Raises:
         ValueError: for a misshapen, negative or infinite entry where there may be none.

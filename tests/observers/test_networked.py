@@ -18,10 +18,11 @@ from khop_env.observers import (
     Proximal,
     Relay,
 )
+from khop_env.observers.merging import largest_share
 from khop_env.observers.scalar import solve_alone
 from khop_env.observers.solve import solve
-from khop_env.physics import DoubleIntegrator, Fleet, SingleIntegrator
-from khop_env.scenarios import paper
+from khop_env.physics import AgentModel, DoubleIntegrator, Fleet, Growth, SingleIntegrator
+from khop_env.scenarios import mixed_fleet, paper
 from khop_env.simulation import InitialSet, Simulator
 from tests.strategies import NETWORKS, SEEDS, systems
 
@@ -282,6 +283,92 @@ def test_an_estimator_of_ones_own_is_a_class():
     assert repr(simulator.observers).endswith("held)")
 
 
+class Drag(AgentModel):
+    """x' = -30 x + u: faster than steps of 50 ms can follow."""
+
+    type, states, inputs, position, input_limit = "drag", {"x": "m"}, {"u": "m/s"}, ("x",), 1.0
+
+    def drift(self, t, x):
+        return -30.0 * x
+
+    def input_map(self, t, x, u):
+        return u
+
+    def drift_lipschitz(self):
+        return self.lipschitz
+
+    def drift_growth(self, region=None):
+        return Growth(np.array([[self.declared]]))
+
+
+@pytest.mark.parametrize(("declared", "lipschitz"), [(-30.0, 30.0), (-30.0, np.inf), (0.0, 30.0), (0.0, np.inf)])
+def test_steps_are_divided_until_fast_decays_are_certified(declared, lipschitz):
+    """As declared, as the Lipschitz constant allows, or as seen; too long a step makes 1 + h df/dx negative."""
+    Drag.declared, Drag.lipschitz = declared, lipschitz
+    simulator = chain([Drag()] * 4, "wifi:loss=0.3", num_envs=4).reset(0)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        simulator.step(0.05, bang_bang(simulator, rng))
+        assert excess(simulator) <= 1.0
+    assert simulator.parts_of(0.05) == 2
+
+
+@pytest.mark.parametrize("network", ["ideal:latency=0.05", "ideal:latency=0.12", "lossy:loss=0.3"])
+def test_steps_of_changing_length_leave_bounds_certified(network):
+    """What is on its way meanwhile can't be moved as the plant was: it counts as lost."""
+    simulator = mixed_fleet().build(observers=Networked(network, "relay"), num_envs=8).reset(0)
+    rng = np.random.default_rng(0)
+    for number in range(120):
+        simulator.step((0.05, 0.002)[number % 2] if number < 80 else 0.05, bang_bang(simulator, rng))
+        assert excess(simulator) <= 1.0
+    assert simulator.extremes.relative.max() <= 1.0 + 1e-9
+    assert np.isfinite(simulator.observers.information(simulator.state).age).all()
+
+
+def test_a_limit_is_the_same_after_a_restore():
+    first, second = (paper().build(observers=Networked("wifi", "relay")).reset(0) for _ in range(2))
+    for _ in range(7):
+        first.step(0.02, np.ones(first.fleet.m))
+    second.restore(first.save())
+    found = [each.observers.limits(each.state, np.empty_like(each.state.memory["bound"])) for each in (first, second)]
+    np.testing.assert_array_equal(*found)
+
+
+def test_an_error_that_is_not_a_number_is_reported():
+    for error in ([np.nan, 0.1], [0.1, np.nan]):
+        largest = np.zeros(1)
+        largest_share(np.array([0, 0]), np.array(error)[:, None], np.zeros((1, 1)), np.ones((2, 1)), largest)
+        assert np.isnan(largest[0])
+
+
+def test_a_proposal_that_is_not_a_number_gives_the_prediction():
+    simulator = chain([SingleIntegrator()] * 3, "wifi", LastHeard())
+    simulator.state.memory["held.state"][...] = np.nan
+    simulator.observers._report(simulator.state)
+    np.testing.assert_array_equal(simulator.estimates.T, simulator.state.memory["center"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"proposal": np.zeros(3, int)}, r"proposal must be \(6,\) integers, a row of 'held.state' for each pair"),
+        ({"proposal": np.full(6, 50)}, "proposal asks for 52 rows, and 'held.state' has 12"),
+        ({"proposed": "kept.state"}, "proposed = 'kept.state' isn't in its memory, held.state"),
+        ({"width": 2}, r"message\(\) has 0 rows, its width is 2"),
+        ({"width": None}, r"width must be the number of rows of message\(\), 0 for none; got None"),
+        ({"allocate": lambda: None}, r"allocate\(\) must return a dictionary of arrays, empty for none; got None"),
+    ],
+)
+def test_estimators_that_would_write_beyond_their_rows_are_refused(changes, message):
+    class Wrong(LastHeard):
+        def prepare(self, *arguments):
+            super().prepare(*arguments)
+            vars(self).update(changes)
+
+    with pytest.raises(ValueError, match=f"estimator 'held': {message}"):
+        chain([SingleIntegrator()] * 3, "wifi", Wrong())
+
+
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match="no estimator 'realy'; did you mean 'relay'"):
         Networked("wifi", "realy")
@@ -291,6 +378,8 @@ def test_mistakes_are_named():
         Networked(None)
     with pytest.raises(ValueError, match="which has no prepare"):
         Networked("wifi", type("Mine", (), {"name": "mine"})())
+    with pytest.raises(ValueError, match=r"an estimator is an object, not a class: write Relay\(\)"):
+        Networked("wifi", Relay)
 
 
 def test_a_step_that_is_interrupted_half_way_cannot_be_gone_on_from():
