@@ -24,10 +24,11 @@ import numpy as np
 
 from khop_env.observers.base import SolveError
 from khop_env.observers.design import ObserverDesign
+from khop_env.observers.fingerprint import fingerprint
 from khop_env.observers.layout import FloatArray
 from khop_env.observers.local import local_observers
 from khop_env.observers.remote import Estimate, Received, RemoteAgent
-from khop_env.observers.wire import EstimatorName, Known, Message, NumberFormat, check_choice, fingerprint, rounding
+from khop_env.observers.wire import EstimatorName, Known, Message, NumberFormat, check_choice, rounding
 
 
 class ObserverNode:

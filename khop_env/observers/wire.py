@@ -3,12 +3,13 @@
     bytes   what
     1       version
     1       number format (0 float64, 1 float32, 2 float16), plus 16 with the estimates of the paper's observers
-    4       fingerprint of the fleet: models' states and inputs, links, k, relay, input observers
+    4       fingerprint of the fleet: models with their parameters, links, k, relay, input observers
     2       sender
     8       time, float64
     then    the sender's state; of each agent within k hops: 1 byte for hops, 0 if nothing is known, the age as float32
             (rounded up; the stamp itself where numbers are float64), its state
     then    (+16) the sender's g; its estimates of states, of inputs; the last g of those that it hears, or NaN
+    4       CRC-32 of all that comes before
 
 A message of one agent always has one size. All is little-endian.
 """
@@ -25,6 +26,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from khop_env.observers.design import ObserverDesign
+from khop_env.observers.fingerprint import fingerprint
 from khop_env.observers.layout import FloatArray
 from khop_env.physics import did_you_mean
 
@@ -36,6 +38,7 @@ NumberFormat = Literal["float64", "float32", "float16"]
 
 VERSION = 1
 _HEADER = struct.Struct("<BBIHd")
+_CHECKSUM = struct.Struct("<I")
 _LETTER = {"float64": "d", "float32": "f", "float16": "e"}
 _PPSO = 16
 
@@ -138,13 +141,14 @@ class Message:
         for i, n in form.heard.items():
             values += [*self.heard.get(i, np.full(n, np.nan))]
         try:
-            return form.layout.pack(*values)
+            data = form.layout.pack(*values)
         except OverflowError:
             largest = max((abs(value) for value in values[5:] if np.isfinite(value)), default=0.0)
             raise ValueError(
                 f"message of {self.design.fleet.ids[self.sender]!r}: its largest number is {largest:.6g}, and {dtype} "
                 f"ends at {np.finfo(dtype).max:.6g}; send float32 or float64"
             ) from None
+        return data + _CHECKSUM.pack(zlib.crc32(data))
 
     @staticmethod
     def unpack(data: bytes, design: ObserverDesign) -> Message:
@@ -157,15 +161,21 @@ class Message:
         Raises:
             ValueError: for bytes that are cut off, of another version, of another fleet, or damaged.
         """
-        if len(data) < _HEADER.size:
-            raise ValueError(f"a message has {_HEADER.size} bytes at least; got {len(data)}")
+        least = _HEADER.size + _CHECKSUM.size
+        if len(data) < least:
+            raise ValueError(f"a message has {least} bytes at least; got {len(data)}")
         version, flags, theirs, sender, _ = _HEADER.unpack_from(data)
         if version != VERSION:
             raise ValueError(f"the message has version {version}, this is version {VERSION}; update the older robot")
+        data, checksum = data[: -_CHECKSUM.size], data[-_CHECKSUM.size :]
+        if _CHECKSUM.unpack(checksum)[0] != zlib.crc32(data):
+            raise ValueError(
+                f"the message of {len(data) + _CHECKSUM.size} bytes is damaged or cut off: wrong checksum; drop it"
+            )
         if theirs != fingerprint(design):
             raise ValueError(
                 f"the message is of another fleet ({theirs:08x}) than {design} ({fingerprint(design):08x}): "
-                "models, links, k, relay or input observers differ"
+                "models or their parameters, links, k, relay or input observers differ"
             )
         if sender >= len(design.fleet) or flags & ~_PPSO >= len(_LETTER):
             raise ValueError(f"the message is damaged: its sender is {sender}, its format {flags}")
@@ -173,7 +183,8 @@ class Message:
         form = _form(design, sender, "ppso" if flags & _PPSO else "relay", dtype)
         if len(data) != form.layout.size:
             raise ValueError(
-                f"a message of {design.fleet.ids[sender]!r} has {form.layout.size} bytes in {dtype}; got {len(data)}"
+                f"a message of {design.fleet.ids[sender]!r} has {form.size} bytes in {dtype}; got "
+                f"{len(data) + _CHECKSUM.size}"
             )
         _, _, _, _, time, *rest = form.layout.unpack(data)
         numbers = iter(rest)
@@ -213,7 +224,7 @@ class Message:
             estimator: of its node.
             dtype: format of the numbers.
         """
-        return _form(design, design.fleet.agent(agent), estimator, dtype).layout.size
+        return _form(design, design.fleet.agent(agent), estimator, dtype).size
 
 
 def rounding(dtype: NumberFormat, largest: FloatArray | float) -> FloatArray:
@@ -237,6 +248,11 @@ class _Form:
     input_estimates: Mapping[int, int]
     heard: Mapping[int, int]
     layout: struct.Struct
+
+    @property
+    def size(self) -> int:
+        """Bytes of a message, its checksum included."""
+        return self.layout.size + _CHECKSUM.size
 
 
 @functools.lru_cache(maxsize=1024)
@@ -264,21 +280,6 @@ def _form(design: ObserverDesign, sender: int, estimator: EstimatorName, dtype: 
     layout = struct.Struct(f"{_HEADER.format}{n}{letter}{about_others}{rest}{letter}")
     flags = list(_LETTER).index(dtype) + _PPSO * ppso
     return _Form(estimator, flags, sender in wanted, known, estimates, input_estimates, heard, layout)
-
-
-@functools.lru_cache(maxsize=64)
-def fingerprint(design: ObserverDesign) -> int:
-    """A number that two robots share if they mean the same fleet, links and observers."""
-    links, models = design.links, design.fleet.models
-    structure = (
-        [(model.type, dict(model.states), dict(model.inputs)) for model in models],
-        links.sender.tolist(),
-        links.receiver.tolist(),
-        int(design.k),
-        bool(design.relay),
-        [option.input_observer for option in design.options],
-    )
-    return zlib.crc32(repr(structure).encode())
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

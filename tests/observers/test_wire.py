@@ -1,7 +1,11 @@
 """Messages in bytes: nothing is lost but digits, sizes are as said, and what is wrong is refused."""
 
 import dataclasses
+import os
 import struct
+import subprocess
+import sys
+import zlib
 from typing import get_args
 
 import networkx as nx
@@ -11,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from khop_env.observers import Exponential, Known, Message, ObserverDesign
+from khop_env.observers.fingerprint import fingerprint
 from khop_env.observers.wire import EstimatorName, NumberFormat, rounding
-from khop_env.physics import Fleet, SingleIntegrator
+from khop_env.physics import Fleet, SingleIntegrator, SurfaceVessel
+from khop_env.registry import scenario
 from tests.strategies import SEEDS, System, systems
 
 
@@ -87,37 +93,84 @@ def row(agents: int = 3, k: int = 2, **options: object) -> ObserverDesign:
     )
 
 
+def sealed(data: bytes) -> bytes:
+    """With its checksum, as a sender that is wrong itself would have packed it."""
+    return data + struct.pack("<I", zlib.crc32(data))
+
+
 def test_what_cannot_be_read_is_refused() -> None:
     design = row()
     data = drawn(design, 0, "ppso", 0).pack()
     for damaged, message in (
-        (data[:7], "a message has 16 bytes at least; got 7"),
-        (data[:-1], r"a message of 'integrator_0' has \d+ bytes in float64; got \d+"),
-        (data + b"0", r"a message of 'integrator_0' has \d+ bytes in float64; got \d+"),
+        (data[:7], "a message has 20 bytes at least; got 7"),
+        (data[:-1], rf"the message of {len(data) - 1} bytes is damaged or cut off: wrong checksum; drop it"),
+        (data + b"0", "damaged or cut off"),
         (b"\2" + data[1:], "the message has version 2, this is version 1; update the older robot"),
-        (data[:6] + b"\7" + data[7:], "damaged: its sender is 7"),
-        (data[:1] + b"\x7f" + data[2:], "damaged: .* its format 127"),
-        (data[:16] + struct.pack("<d", np.nan) + data[24:], "state of 'integrator_0' must be 2 finite numbers"),
-        (data[:8] + struct.pack("<d", np.inf) + data[16:], "time is inf; expected seconds"),
+        (sealed(data[:-12]), rf"a message of 'integrator_0' has {len(data)} bytes in float64; got {len(data) - 8}"),
+        (sealed(data[:6] + b"\7" + data[7:-4]), "damaged: its sender is 7"),
+        (sealed(data[:1] + b"\x7f" + data[2:-4]), "damaged: .* its format 127"),
+        (
+            sealed(data[:16] + struct.pack("<d", np.nan) + data[24:-4]),
+            "state of 'integrator_0' must be 2 finite numbers",
+        ),
+        (sealed(data[:8] + struct.pack("<d", np.inf) + data[16:-4]), "time is inf; expected seconds"),
     ):
         with pytest.raises(ValueError, match=message):
             Message.unpack(damaged, design)
     for other in (row(4), row(3, relay=False), row(3, k=3)):
-        with pytest.raises(ValueError, match=r"the message is of another fleet \(.*models, links, k, relay or input"):
+        with pytest.raises(ValueError, match=r"the message is of another fleet \(.*parameters, links, k, relay or"):
             Message.unpack(data, other)
+
+
+@given(seed=SEEDS)
+def test_a_flipped_bit_is_refused(seed: int) -> None:
+    design, rng = row(), np.random.default_rng(seed)
+    data = bytearray(drawn(design, 1, "ppso", seed).pack(rng.choice(get_args(NumberFormat))))
+    place = int(rng.integers(len(data)))
+    data[place] ^= 1 << int(rng.integers(8))
+    with pytest.raises(ValueError, match="version" if place == 0 else "wrong checksum"):
+        Message.unpack(bytes(data), design)
 
 
 @settings(max_examples=200)
 @given(seed=SEEDS)
-def test_damaged_bytes_are_a_message_or_a_value_error(seed: int) -> None:
+def test_any_bytes_are_a_message_or_a_value_error(seed: int) -> None:
     design, rng = row(), np.random.default_rng(seed)
     data = bytearray(drawn(design, 1, "ppso", seed).pack(rng.choice(get_args(NumberFormat))))
     data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
     try:
-        message = Message.unpack(bytes(data), design)
+        message = Message.unpack(sealed(bytes(data[:-4])), design)
     except ValueError:
         return
     assert np.isfinite(np.concatenate(arrays(message))).all()
+
+
+def of_fleet(*models) -> ObserverDesign:
+    return ObserverDesign(
+        Fleet(models), nx.path_graph(len(models)), 2, Exponential(9, 1, 1), Exponential(9, 1, 1), design_rule="sharp"
+    )
+
+
+def test_fingerprints_tell_parameters_apart() -> None:
+    base = fingerprint(of_fleet(*[SingleIntegrator(2, input_limit=6)] * 3))
+    assert base == fingerprint(of_fleet(*[SingleIntegrator(2, input_limit=6.0)] * 3))
+    for other in (SingleIntegrator(2, input_limit=0.1), SingleIntegrator(2, input_limit=(6.0, 5.0))):
+        assert fingerprint(of_fleet(*[SingleIntegrator(2, input_limit=6)] * 2, other)) != base
+    vessels = [SurfaceVessel(quadratic_drag=(drag, 36.3, 0.75)) for drag in (1.33, 1.4)]
+    assert len({fingerprint(of_fleet(vessel, vessel)) for vessel in vessels}) == 2
+
+
+def test_fingerprints_are_the_same_in_every_process() -> None:
+    """Strings hash differently there, and objects lie elsewhere in memory."""
+    program = (
+        "from khop_env.observers.wire import fingerprint; from khop_env.registry import scenario; "
+        "print(fingerprint(scenario('mixed_fleet').design))"
+    )
+    found = [
+        subprocess.run([sys.executable, "-c", program], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True)
+        for seed in "12"
+    ]
+    assert [int(each.stdout) for each in found] == [fingerprint(scenario("mixed_fleet").design)] * 2
 
 
 def test_numbers_that_are_too_large_are_refused() -> None:
