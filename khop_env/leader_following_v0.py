@@ -157,7 +157,8 @@ values are clipped and counted in the infos
 
 `network`: how messages are exchanged: a profile ("ideal", "urllc", "factory", "wifi", "lossy", "saturation", "espnow",
 "crazyradio"), also with other values ("lossy:period=0.1,loss=0.1..0.3,burst=5"), a `khop_env.network.Network` or a
-mapping of its values. By default the scenario's own, which is none: exchange in continuous time
+mapping of its values; "none" for exchange in continuous time, without messages. By default (None) the scenario's own,
+which is that, too, unless its file says otherwise
 
 `estimator`: from messages to estimates under a network: "ppso" for the paper's observers, "relay" for stamped states
 that are passed on and predicted, or an object of your own. By default the scenario's own, "ppso"

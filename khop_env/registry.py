@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
 from khop_env.extras import how_to_install
+from khop_env.network import Network
 from khop_env.objects import is_object_name, load_object
 from khop_env.observers import Networked, Observers, Proximal
 from khop_env.physics import did_you_mean
@@ -286,7 +287,7 @@ def _defaults(settings: type[Settings]) -> dict[str, Any]:
 
 def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Observers]:
     """The observers, and the settings with the scenario's network and estimator where none are chosen."""
-    network = scenario.network if settings.network is None else settings.network
+    network = Network.of(scenario.network if settings.network is None else settings.network)
     if network is None:
         if settings.estimator is not None:
             name = settings.estimator if isinstance(settings.estimator, str) else settings.estimator.name
@@ -294,7 +295,7 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
                 f"estimator: {name!r} makes estimates from messages, and there is no network: choose one, e.g. "
                 "network='wifi'"
             )
-        return settings, Proximal(settings.order, settings.threads)
+        return dataclasses.replace(settings, network=None), Proximal(settings.order, settings.threads)
     if settings.order != 1:
         raise ValueError(
             f"order={settings.order} is of simulators without a network; under one steps are of order 1: leave it out, "

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from khop_env.env import Settings
+from khop_env.network import NO_NETWORK
 from khop_env.physics import did_you_mean
 from khop_env.tasks import Task
 
@@ -41,7 +42,10 @@ def environment_arguments(
     for name, option in (elsewhere or {}).items():
         if any(text.partition("=")[0].strip() == name for text in texts or ()):
             raise ValueError(f"--env {name}: this command sets it by {option}")
-    return typed_values(texts or (), "--env", known)
+    found = typed_values(texts or (), "--env", known)
+    if "network" in found and found["network"] is None:  # "none" is a network's name; None the scenario's own
+        found["network"] = NO_NETWORK
+    return found
 
 
 def environment_types(task: Task | type[Task]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """`khop network`, and --network of the other commands, as their users call them."""
 
 import json
+import sys
 from pathlib import Path
 
 import polars as pl
@@ -156,7 +157,7 @@ class TestRun:
         [
             (
                 ("paper", "--estimator", "relay"),
-                "--estimator relay: estimates are made from messages, and paper has",
+                "--estimator relay: estimates are made from messages, and there is no network",
             ),
             (("paper", "--network", "wify"), "no network 'wify'; did you mean 'wifi'?"),
             (("paper", "--network", "wifi", "--order", "2"), "--order: over a network estimates follow from rounds of"),
@@ -194,7 +195,20 @@ def test_evaluate_over_a_network():
     }
     assert len(set(found.values())) == 3
     text = khop("evaluate", "consensus_v0", *options, "--network", "lossy:loss=0.3", "--estimator", "relay").stdout
-    assert "consensus_v0 on paper over lossy:loss=0.3, relay, 2 episodes" in " ".join(text.split())
+    text = " ".join(text.split())
+    over = "(a message every 50 ms, 30 % lost, 30 +- 5 ms late), estimator relay, 2 episodes"
+    assert f"consensus_v0 on paper over a network {over}" in text
+    assert "its certified bound (at most 1 by guarantee)" in text
+    assert "below 1 by guarantee" not in text
+    assert "|xi|" not in text  # relay has no disagreements
+    text = " ".join(khop("evaluate", "consensus_v0", *options, "--network", "wifi").stdout.split())
+    assert "|e|: largest |xi| / rho of what agents hold" in text
+    found = only_json(khop("evaluate", "consensus_v0", *options, "--network", "wifi", "--estimator", "relay", "--json"))
+    assert (found["network"], found["estimator"]) == ("a message every 50 ms, 1 % lost, 10 +- 1 ms late", "relay")
+    assert found["rows"][0]["max_normalized_disagreement"] is None
+    assert "of all observers, below 1 by guarantee" in " ".join(
+        khop("evaluate", "consensus_v0", *options).stdout.split()
+    )
 
 
 def test_train_over_a_network(folder):
@@ -221,3 +235,101 @@ def test_train_over_a_network(folder):
         )
     )
     assert len(played["rows"]) == 1
+
+
+OWN = """
+from khop_env.observers import Relay
+
+class Mine(Relay):
+    name = "mine"
+
+made = Mine()
+number = 3
+
+class Broken(Relay):
+    def __init__(self):
+        raise RuntimeError("no antenna")
+"""
+
+
+class TestOwnEstimator:
+    @pytest.fixture(autouse=True)
+    def own(self, folder, monkeypatch):
+        monkeypatch.delitem(sys.modules, "own_estimator", raising=False)  # of the test before
+        (folder / "own_estimator.py").write_text(OWN)
+
+    @pytest.mark.parametrize("name", ["own_estimator.py:Mine", "own_estimator:made"])
+    def test_it_stands_wherever_a_name_goes(self, name):
+        over = "--network", "wifi", "--estimator", name
+        for command in (("run", "paper"), ("run", "consensus_v0")):
+            found = only_json(khop(*command, *over, "--duration", "0.2", "--json"))
+            assert (found["estimator"], found["violations"]) == ("mine", 0)
+            assert "wifi-mine" in found["files"]["summary"]
+            assert found["configuration"]["estimator_content"]  # another file of this name is another run
+        assert only_json(khop("check", "paper", *over, "--json"))["network"]["estimator"] == "mine"
+        played = "evaluate", "consensus_v0", "--policies", "zero", "--observe", "estimate", "--episodes", "2", "--json"
+        short = "--env", "max_cycles=4"
+        assert only_json(khop(*played, *short, *over))["estimator"] == "mine"
+        by_env = "--network", "wifi", "--env", f"estimator={name}"
+        assert only_json(khop(*played, *short, *by_env))["estimator"] == "mine"
+
+    def test_in_a_list(self):
+        options = "--networks", "wifi", "--estimators", "relay,own_estimator.py:Mine"
+        rows = only_json(khop("network", "paper", *options, *SHORT, "--json"))["rows"]
+        assert [row["estimator"] for row in rows] == ["relay", "mine"]
+        assert rows[0]["mean_error"] == rows[1]["mean_error"]
+
+    @pytest.mark.parametrize(
+        ("name", "said"),
+        [
+            ("own_estimator.py:Mien", "own_estimator.py has no 'Mien'; it has"),
+            (
+                "own_estimator.py:number",
+                "own_estimator.py:number: an estimator is a name (ppso, relay) or an Estimator",
+            ),
+            ("own_estimator.py:Broken", "own_estimator.py:Broken raised RuntimeError: no antenna"),
+            ("nowhere.py:Mine", "no file 'nowhere.py'"),
+        ],
+    )
+    def test_mistakes(self, name, said):
+        assert said in refused("run", "paper", "--network", "wifi", "--estimator", name)
+        assert said in refused("network", "paper", "--estimators", name)
+        assert said in refused("evaluate", "consensus_v0", "--network", "wifi", "--estimator", name)
+
+    def test_a_configuration_of_a_training_cannot_hold_it(self):
+        said = refused("train", "consensus_v0", "--network", "wifi", "--estimator", "own_estimator.py:Mine")
+        assert (
+            "estimator 'mine': the configuration of a training is a file, which can't hold an estimator of your" in said
+        )
+
+
+class TestNone:
+    """Continuous exchange, on a scenario that has a network."""
+
+    @pytest.fixture(autouse=True)
+    def own(self, folder):
+        text = khop("export", "paper").stdout
+        (folder / "own.toml").write_text(text + '\n[network]\nprofile = "espnow"\nestimator = "relay"\n')
+
+    def test_commands(self):
+        off = "--network", "none"
+        found = only_json(khop("run", "own.toml", "--duration", "0.2", "--json", *off))
+        assert "network" not in found
+        assert found["integrator"] == "proximal"
+        found = only_json(khop("run", "consensus_v0", "--scenario", "own.toml", "--duration", "0.2", "--json", *off))
+        assert "network" not in found
+        assert only_json(khop("check", "own.toml", "--json", *off)).get("network") is None
+        played = "evaluate", "consensus_v0", "--scenario", "own.toml", "--policies", "zero", "--observe", "estimate"
+        short = "--episodes", "2", "--env", "max_cycles=4", "--json"
+        assert only_json(khop(*played, *short))["estimator"] == "relay"
+        for chosen in (off, ("--env", "network=none")):
+            found = only_json(khop(*played, *short, *chosen))
+            assert (found["network"], found["estimator"]) == (None, None)
+
+    def test_with_an_estimator_it_is_refused(self):
+        said = refused("run", "own.toml", "--network", "none", "--estimator", "relay")
+        assert "there is no network; choose one, e.g. --network wifi" in said
+
+    def test_there_is_nothing_to_draw(self):
+        said = refused("network", "paper", "--networks", "none,wifi", "--figure", "network.png")
+        assert "--figure varies the first network's period and loss, and 'none' has no messages" in said

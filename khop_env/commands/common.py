@@ -14,7 +14,7 @@ import typer
 from khop_env.terminal import say
 
 if TYPE_CHECKING:
-    from khop_env.observers import Networked
+    from khop_env.observers import Estimator, Networked
     from khop_env.scenarios import Scenario
     from khop_env.tasks import Task
 
@@ -67,14 +67,15 @@ NetworkOption = Annotated[
     typer.Option(
         "--network",
         help="Messages instead of continuous exchange: ideal, factory, wifi, espnow, ... (khop network), also with "
-        "other values, lossy:loss=0.3,burst=5; by default the scenario's own, if any.",
+        "other values, lossy:loss=0.3,burst=5; none: continuous exchange; by default the scenario's own, if any.",
     ),
 ]
 EstimatorOption = Annotated[
     str | None,
     typer.Option(
         "--estimator",
-        help="Estimates from messages: ppso (the paper's observers, by rounds) or relay (stamped states, passed on).",
+        help="Estimates from messages: ppso (the paper's observers, by rounds), relay (stamped states, passed on), or "
+        "a class of your own, my_file.py:MyEstimator.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -130,30 +131,55 @@ def networked(scenario: Scenario, network: str | None, estimator: str | None) ->
     Raises:
         ValueError: for an unknown network or estimator, or an estimator without a network.
     """
+    from khop_env.network import Network
     from khop_env.observers import Networked
 
-    chosen = scenario.network if network is None else network
+    own = None if estimator is None else loaded_estimator(estimator)
+    chosen = Network.of(scenario.network if network is None else network)
     if chosen is None:
         if estimator is not None:
             raise ValueError(
-                f"--estimator {estimator}: estimates are made from messages, and {scenario.name} has no network; give "
-                "--network, too, e.g. --network wifi"
+                f"--estimator {estimator}: estimates are made from messages, and there is no network; choose one, e.g. "
+                "--network wifi"
             )
         return None
-    return Networked(chosen, scenario.estimator if estimator is None else estimator)
+    return Networked(chosen, scenario.estimator if own is None else own)
+
+
+def loaded_estimator(name: str) -> str | Estimator:
+    """The estimator that a Python object's name stands for, made if it is a class; any other name as it is.
+
+    Raises:
+        ValueError: if there is no such object, or it isn't an estimator.
+    """
+    from khop_env.objects import called, is_object_name, load_object
+    from khop_env.observers import as_estimator
+
+    if not is_object_name(name):
+        return name
+    found = load_object(name)
+    if isinstance(found, type):
+        found = called(name, found)
+    try:
+        return as_estimator(found)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def with_network(arguments: dict[str, Any], network: str | None, estimator: str | None) -> dict[str, Any]:
     """The arguments of an environment, with a network and an estimator where options choose them.
 
     Raises:
-        ValueError: where --env chooses them, too.
+        ValueError: where --env chooses them, too, or for an estimator that can't be loaded.
     """
     options = {"network": network, "estimator": estimator}
     for name, value in options.items():
         if value is not None and name in arguments:
             raise ValueError(f"--env {name} and --{name}: choose one of them")
-    return arguments | {name: value for name, value in options.items() if value is not None}
+    found = arguments | {name: value for name, value in options.items() if value is not None}
+    if isinstance(found.get("estimator"), str):
+        found["estimator"] = loaded_estimator(found["estimator"])
+    return found
 
 
 def find_environment(name: str) -> Task | type[Task] | None:

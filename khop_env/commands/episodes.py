@@ -189,7 +189,10 @@ def configuration_of(scenario: Scenario, episode: Episode, observe: str, seed: i
         "controller_content": episode.content,
     }
     if isinstance(episode.observers, Networked):
-        found |= {"network": plain(episode.observers.network), "estimator": episode.observers.estimator.name}
+        estimator = episode.observers.estimator
+        found |= {"network": plain(episode.observers.network), "estimator": estimator.name}
+        if own := sources([estimator]):
+            found["estimator_content"] = digest(own)
     if episode.played is not None:
         batched = episode.played.env.batched
         found |= {"environment": batched.task.environment, "settings": plain(batched.settings)}

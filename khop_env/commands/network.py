@@ -15,6 +15,7 @@ from khop_env.commands.common import (
     JsonOption,
     ScenarioArgument,
     load,
+    loaded_estimator,
     mistakes,
     print_json,
     require_figure,
@@ -23,6 +24,7 @@ from khop_env.terminal import Progress, folded, print_table, print_text, say, wa
 
 if TYPE_CHECKING:
     from khop_env.network import Network
+    from khop_env.observers import Estimator
     from khop_env.results.networks import NetworkRow
     from khop_env.scenarios import Scenario
 
@@ -44,7 +46,11 @@ def network(
         ),
     ] = None,
     estimators: Annotated[
-        str, typer.Option(help="ppso: the paper's observers, by rounds; relay: stamped states, passed on.")
+        str,
+        typer.Option(
+            help="ppso: the paper's observers, by rounds; relay: stamped states, passed on; classes of your own, "
+            "my_file.py:MyEstimator."
+        ),
     ] = "ppso,relay",
     periods: Annotated[
         str | None, typer.Option(help="Seconds between messages of an agent, 0.01,0.02; by default each network's own.")
@@ -82,10 +88,12 @@ def network(
     with mistakes(name):
         require_figure(figure)
         chosen = _profiles() if networks is None else split_specs(networks, "--networks", "network")
-        by = split_specs(estimators, "--estimators", "estimator")
+        by = [loaded_estimator(each) for each in split_specs(estimators, "--estimators", "estimator")]
         times = None if periods is None else _numbers(periods)
         scenario = load(name)
         base = Network.of(chosen[0])
+        if figure is not None and base is None:
+            raise ValueError("--figure varies the first network's period and loss, and 'none' has no messages")
         plan: list[tuple[Sequence[Any], list[float] | None]] = [([None], None), (chosen, times)]
         plan += [(some, None) for some in sweeps(base)] if figure is not None and base is not None else []
         arguments = {"observe": observe.value, "episodes": episodes, "duration": duration, "seed": seed}
@@ -123,7 +131,10 @@ def network(
 
 
 def _parts(
-    scenario: Scenario, plan: Iterable[tuple[Sequence[Any], Sequence[float] | None]], by: Sequence[str], arguments: Any
+    scenario: Scenario,
+    plan: Iterable[tuple[Sequence[Any], Sequence[float] | None]],
+    by: Sequence[str | Estimator],
+    arguments: Any,
 ) -> list[Iterator[NetworkRow]]:
     """The rows of each part of a plan, networks and periods, checked and not measured yet."""
     from agents.laws import make_law

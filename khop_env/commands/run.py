@@ -103,6 +103,7 @@ def run(
     Exits with 1 if a funnel, or a certified bound, was left. All results up to then are written. A folder with another
     run in it is left alone.
     """
+    from khop_env.observers import Networked
     from khop_env.results import RunFileError, record, summarize, write_run
 
     with mistakes(scenario or name), waiting(f"designing the observers of {name}"):
@@ -129,7 +130,10 @@ def run(
         parts = [chosen.name, episode.controller, observe.value, "explicit" * (episode.observers.name == "explicit")]
         if played is not None:
             parts.insert(0, played.env.batched.task.environment)
-        parts += [network or "", estimator or ""]
+        parts += [
+            network or "",
+            episode.observers.estimator.name if estimator and isinstance(episode.observers, Networked) else "",
+        ]
         folder = choose_folder(Path("runs") / folder_name(*parts, f"seed{seed}"), out, configuration)
     with Progress(f"simulating {chosen.name}") as progress:
         recording = record(

@@ -171,6 +171,7 @@ def _chosen(
     """
     from agents.learning import TrainingConfig
     from agents.learning.config_file import read_config, setting_types
+    from khop_env.observers import ESTIMATORS
     from khop_env.registry import find_task
     from khop_env.typed import environment_arguments, environment_types, fitting_values, typed_values
 
@@ -183,6 +184,12 @@ def _chosen(
     elsewhere = {"observe": "--observe", "bounds": "--bounds"}
     arguments = fitting_values(found.get("arguments", {}), f"{file}: arguments", environment_types(task))
     found["arguments"] = arguments | with_network(environment_arguments(env, task, elsewhere), *over)
+    estimator = found["arguments"].get("estimator")
+    if not isinstance(estimator, str | None):
+        raise ValueError(
+            f"estimator {estimator.name!r}: the configuration of a training is a file, which can't hold an estimator "
+            f"of your own; choose one of {', '.join(ESTIMATORS)}"
+        )
     if found.get("scenario") is not None:
         load(found["scenario"])  # refuses one with a law that there isn't, as every command does
     return TrainingConfig(**({**_OF_SAC, **found} if found.get("algorithm") == "sac" else found))

@@ -9,7 +9,7 @@ from typing import TypedDict
 import numpy as np
 
 from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
-from khop_env.network import Network
+from khop_env.network import NO_NETWORK, Network
 from khop_env.observers import Estimator, as_estimator
 from khop_env.observers.proximal import MOST_THREADS
 from khop_env.physics import did_you_mean
@@ -38,8 +38,8 @@ class Settings:
             are clipped.
         threads: of the observers' solve; not used under a network.
         network: how messages are exchanged: a profile's name, also with other values as in "lossy:period=0.1,loss=0.3",
-            a `Network` or a mapping of its values; None for the scenario's own, which by default is none: exchange in
-            continuous time.
+            a `Network` or a mapping of its values; "none" for exchange in continuous time, without messages; None for
+            the scenario's own, which by default is that, too.
         estimator: from messages to estimates under a network: "ppso" for the paper's observers, "relay" for stamped
             states that are passed on, or an `Estimator`; None for the scenario's own, "ppso" by default.
 
@@ -86,7 +86,8 @@ class Settings:
                 "control_period must be from 1e-9 to 1e9 s, and at most a million simulator steps; got "
                 f"control_period = {self.control_period:g} s" + ("" if self.dt is None else f" and dt = {self.dt:g} s")
             )
-        object.__setattr__(self, "network", Network.of(self.network))
+        if self.network != NO_NETWORK:  # which isn't the scenario's own
+            object.__setattr__(self, "network", Network.of(self.network))
         if self.estimator is not None:
             as_estimator(self.estimator)  # raises for an unknown name
         object.__setattr__(self, "actuator", as_actuator(self.actuator))

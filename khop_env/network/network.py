@@ -12,6 +12,10 @@ from khop_env.physics import did_you_mean
 MOST_ROUNDS_LATE = 4096
 
 
+NO_NETWORK = "none"
+"""Name of exchange in continuous time, where None stands for "as the scenario has it"."""
+
+
 @dataclass(frozen=True)
 class Network:
     """Every `period` seconds each agent broadcasts a message; every directed link loses it or delivers it late.
@@ -84,17 +88,19 @@ class Network:
             Network.of("wifi")
             Network.of("lossy:period=0.1,loss=0.1..0.3,burst=5")    # a profile with other numbers; a range
             Network.of({"profile": "lossy", "loss": [0.1, 0.3]})    # a table of a scenario file
-            Network.of(None)                                        # no messages: exchange in continuous time
+            Network.of("none")                                      # no messages: exchange in continuous time
 
         Args:
             network: a profile of `PROFILES` by name, with other values after a colon; a mapping of values, to `ideal`
-                if no profile is named; a network; or None.
+                if no profile is named; a network; "none" or None for no messages.
 
         Raises:
             ValueError: for an unknown profile or key, or a value that isn't right.
         """
         if network is None or isinstance(network, Network):
             return network
+        if network == NO_NETWORK:
+            return None
         if isinstance(network, Mapping):
             values = dict(network)
             return _changed(values.pop("profile", "ideal"), values)

@@ -10,7 +10,16 @@ from typing import Any, get_args
 import numpy as np
 
 from khop_env.network import Network
-from khop_env.observers import IntArray, Message, Networked, ObserverDesign, Observers, PairLayout, Proximal
+from khop_env.observers import (
+    Estimator,
+    IntArray,
+    Message,
+    Networked,
+    ObserverDesign,
+    Observers,
+    PairLayout,
+    Proximal,
+)
 from khop_env.observers.wire import EstimatorName
 from khop_env.results.metrics import finite, violations
 from khop_env.scenarios import Scenario
@@ -70,7 +79,7 @@ def measure_networks(
     scenario: Scenario,
     law: Law,
     networks: Sequence[str | Network | None],
-    estimators: Sequence[str] = ("ppso", "relay"),
+    estimators: Sequence[str | Estimator] = ("ppso", "relay"),
     periods: Sequence[float] | None = None,
     *,
     observe: Observe = "estimate",
@@ -88,7 +97,7 @@ def measure_networks(
         scenario: agents, graphs, disturbances and bounds.
         law: feedback law, e.g. `agents.make_law(scenario.law)`.
         networks: what `Network.of` takes; None for the paper's continuous exchange, without messages.
-        estimators: names, as in `Networked`; continuous exchange has the paper's observers only.
+        estimators: names or objects, as in `Networked`; continuous exchange has the paper's observers only.
         periods: in s, instead of each network's own.
         observe: what the law acts on: "estimate"; or "oracle" (true states), so that all rows have the same motion.
         episodes: of each row, all at once.

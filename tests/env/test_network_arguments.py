@@ -43,6 +43,8 @@ def test_an_environment_s_own_network_replaces_the_scenario_s():
     env = consensus_v0.batched_env(scenario, estimator="ppso")
     assert (env.settings.network, env.simulator.observers.estimator.name) == (Network.of("lossy"), "ppso")
     assert consensus_v0.batched_env(scenario.replace(network=None)).simulator.observers.name == "proximal"
+    env = consensus_v0.batched_env(scenario, network="none")
+    assert (env.settings.network, env.simulator.observers.name) == (None, "proximal")
     with pytest.raises(ValueError, match="scenario 'paper': no network 'wify'"):
         scenario.replace(network="wify")
     with pytest.raises(ValueError, match="scenario 'paper': no estimator 'rely'"):
