@@ -20,7 +20,7 @@ from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, Networked
 from khop_env.registry import Environment, make_batched
 from khop_env.results.metrics import finite
 from khop_env.results.recording import Progress
@@ -85,12 +85,16 @@ class Comparison:
         environment: name of the environment.
         scenario: name of the scenario.
         planned: number of episodes requested per row; after an interrupt rows may have fewer, or be missing.
+        network: over which agents know of each other, in words; None for continuous exchange.
+        estimator: its name; None for continuous exchange.
         rows: in the requested order.
     """
 
     environment: str
     scenario: str
     planned: int
+    network: str | None = None
+    estimator: str | None = None
     rows: list[Row] = field(default_factory=list)
 
     __repr__ = brief
@@ -101,7 +105,10 @@ class Comparison:
         for row, summary in zip(self.rows, summaries, strict=True):
             if len(row.episodes.seed) < self.planned:
                 summary["episodes"] = len(row.episodes.seed)
-        where = {"environment": self.environment, "scenario": self.scenario, "episodes": self.planned}
+            if self.network is not None and not summary["max_normalized_disagreement"]:
+                summary["max_normalized_disagreement"] = None  # an estimator without funnels
+        where: dict[str, Any] = {"environment": self.environment, "scenario": self.scenario, "episodes": self.planned}
+        where |= {"network": self.network, "estimator": self.estimator}
         unit = self.rows[0].env.error_unit if self.rows else None
         return {**where, "task_error_unit": unit, "rows": summaries}
 
@@ -173,12 +180,14 @@ def compare(
                 policy.reset(env, [0])
             except ValueError as error:
                 raise ValueError(f"policy {spec!r}: {error}") from error
+    observers = player.environment(observe[0], rows[0][2]).simulator.observers
+    over = (observers.network.described(), observers.estimator.name) if isinstance(observers, Networked) else ()
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
     tasks: list[_Task] = [(spec, env.observe, bounds, chunk) for spec, env, bounds in rows for chunk in chunks]
     results: list[Episodes | None] = [None] * len(tasks)
 
     def comparison() -> Comparison:
-        result = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds))
+        result = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds), *over)
         for number, (spec, env, _) in enumerate(rows):
             parts = list(itertools.takewhile(bool, results[number * len(chunks) : (number + 1) * len(chunks)]))
             if parts:

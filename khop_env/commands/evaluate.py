@@ -69,7 +69,6 @@ def evaluate(
         require_figure(figure)
         arguments = environment_arguments(env, find_task(environment), {"observe": "--observe"})
         arguments = with_network(arguments, network, estimator)
-        over = ", ".join(str(arguments[name]) for name in ("network", "estimator") if name in arguments)
         chosen = None if scenario is None else load(scenario)
         with Progress(f"playing {environment}") as progress:
             try:
@@ -89,7 +88,7 @@ def evaluate(
             except UnfinishedError as error:
                 comparison, unfinished = error.partial, (str(error), 2)
     if comparison.rows:
-        _print(comparison, csv, as_json, f" over {over}" if over else "")
+        _print(comparison, csv, as_json)
         if figure is not None:
             _draw(comparison, figure)
     if unfinished is not None:
@@ -98,13 +97,13 @@ def evaluate(
         raise typer.Exit(status)
 
 
-def _print(comparison: Comparison, csv: bool, as_json: bool, over: str) -> None:
+def _print(comparison: Comparison, csv: bool, as_json: bool) -> None:
     if as_json:
         print_json(comparison.summary())
     elif csv:
         typer.echo(comparison.frame().write_csv(), nl=False)
     else:
-        print_comparison(comparison, over)
+        print_comparison(comparison)
 
 
 def _draw(comparison: Comparison, figure: Path) -> None:
@@ -120,8 +119,11 @@ def _draw(comparison: Comparison, figure: Path) -> None:
     say(f"figure: {figure}")
 
 
-def print_comparison(comparison: Comparison, over: str) -> None:
-    """The table; `over` says which network it is about."""
+def print_comparison(comparison: Comparison) -> None:
+    """The table, and what its columns are."""
+    networked = comparison.network is not None
+    # over a network only some estimators have disagreements, which no guarantee is about
+    no_disagreement = networked and not any(row.episodes.max_normalized_disagreement.any() for row in comparison.rows)
     rows = []
     for number, row in enumerate(comparison.rows):
         seen = row.summary()
@@ -137,20 +139,26 @@ def print_comparison(comparison: Comparison, over: str) -> None:
                 f"{seen['final_task_error']:.3g}",
                 "never" if settling is None else f"{settling:.3g}",
                 f"{seen['effort']:.3g}",
-                f"{seen['max_normalized_disagreement']:.3f}",
+                "" if no_disagreement else f"{seen['max_normalized_disagreement']:.3f}",
                 f"{seen['max_error_to_bound']:.3f}",
             )
         )
     unit = comparison.rows[0].env.error_unit
     header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", "|e|", "e / bound")
-    where = f"{comparison.environment} on {comparison.scenario}{over}"
+    where = f"{comparison.environment} on {comparison.scenario}"
+    if networked:
+        where += f" over a network ({comparison.network}), estimator {comparison.estimator}"
+    disagreement = "|e|: largest |xi| / rho" + (" of what agents hold" if networked else "")
+    guarantee = "bound (of all observers, below 1 by guarantee)"
+    if networked:
+        guarantee = "certified bound (at most 1 by guarantee)"
     title = f"{where}, {comparison.planned} episodes, the same for every row"
     print_table(header, rows, title)
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
         "mean over agents and episodes, at the end; settled: median time from which the team's mean task error stays "
-        "below a tenth of the initial one; effort: mean |u|^2, u in fractions of the limits; |e|: largest |xi| / rho; "
-        "e / bound: largest estimation error over its bound (of all observers, below 1 by guarantee)"
+        "below a tenth of the initial one; effort: mean |u|^2, u in fractions of the limits; "
+        f"{'' if no_disagreement else f'{disagreement}; '}e / bound: largest estimation error over its {guarantee}"
     )
 
 
