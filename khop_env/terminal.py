@@ -184,7 +184,7 @@ def _print_certified(summary: Mapping[str, Any]) -> None:
     ratio = f"largest |error| / certified bound {_ratio(summary['max_error_to_bound'])}"
     if summary["max_normalized_disagreement"] is not None:
         ratio += f"; |xi|/rho of what agents hold {_ratio(summary['max_normalized_disagreement'])}"
-    kept = "kept" if summary["funnel_kept"] else "not kept"
+    kept = "kept" if summary["bounds_kept"] else "not kept"
     violated = f"{summary['violations']} violations in {summary['pair_samples']} pairs and samples"
     print_text(f"certified bounds {kept}: {ratio}; {violated}")
     for agent, reason in itertools.islice(summary["uncertified"].items(), _SHOWN_IDS):

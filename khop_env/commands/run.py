@@ -172,9 +172,10 @@ def run(
     if failures := [failure for failure in (unwritten, unfilmed) if failure is not None]:
         for failure in failures:
             say(f"khop: {failure}")
-    if failures or (recording.error is not None and summary["funnel_kept"]):
+    kept = summary.get("bounds_kept", summary["funnel_kept"])
+    if failures or (recording.error is not None and kept):
         raise typer.Exit(2)
-    if not summary["funnel_kept"]:
+    if not kept:
         raise typer.Exit(1)
 
 

@@ -66,9 +66,11 @@ def summarize(
     reach its observer, so that there was no guarantee.
 
     Over a network of messages the certified bounds are what is guaranteed, and the disagreements are those that the
-    estimator's agents compute from what they hold, null where it has none. There are further keys: `network` and
-    `estimator`; `violations`, how many of the `pair_samples` (pairs and samples) have an error above the certified
-    bound; `mean_age`, of the states that have arrived, in s; and `uncertified`, by agent why it has no bound.
+    estimator's agents compute from what they hold, null where it has none. `funnel_kept` is about
+    these only, and null, too, where there are none. There are further keys: `network` and `estimator`; `bounds_kept`,
+    which is True if errors kept their certified bounds and the run reached its end with finite states; `violations`,
+    how many of the `pair_samples` (pairs and samples) have an error above the certified bound; `mean_age`, of the
+    states that have arrived, in s; and `uncertified`, by agent why it has no bound.
 
     Args:
         recording: recording of the run.
@@ -84,8 +86,11 @@ def summarize(
     input_ratios = [extremes.input_normalized[0], extremes.input_relative[0]]
     states, networked = recording.states, isinstance(observers, Networked)
     has_inputs = recording.inputs is not None and recording.design.inputs.layout.size > 0
-    most = 1.0 + ROUNDING if networked else 1.0  # an error may reach its certified bound
-    kept = all(ratio < most for ratio in (*state_ratios, *input_ratios)) and bool(np.all(np.isfinite(recording.x)))
+    ended = recording.completed or isinstance(recording.error, StoppedError)
+    ended = ended and bool(np.all(np.isfinite(recording.x)))
+    without_funnels = networked and not state_ratios[0]
+    disagreements, errors = zip(state_ratios, input_ratios, strict=True)
+    kept = all(ratio < 1.0 for ratio in (disagreements if networked else disagreements + errors))
     found = {
         "scenario": scenario.name,
         "controller": controller,
@@ -100,14 +105,14 @@ def summarize(
         "wall_time_s": recording.wall_time,
         "agents": len(recording.fleet),
         "pairs": states.layout.pairs,
-        "max_normalized_disagreement": None if networked and not state_ratios[0] else finite(state_ratios[0]),
+        "max_normalized_disagreement": None if without_funnels else finite(state_ratios[0]),
         "max_error_to_bound": finite(state_ratios[1]),
         "max_normalized_disagreement_input": finite(input_ratios[0]) if has_inputs else None,
         "max_error_to_bound_input": finite(input_ratios[1]) if has_inputs else None,
         "position_unit": recording.fleet.position_unit(),
         "final_consensus_error": finite(float(consensus_error(recording.fleet, recording.x[-1]))),
         "diverged": _diverged(recording.x),
-        "funnel_kept": (recording.completed or isinstance(recording.error, StoppedError)) and kept,
+        "funnel_kept": None if without_funnels else ended and kept,
         "error": None if recording.error is None else str(recording.error),
         "versions": {
             "khop_env": khop_env.__version__,
@@ -116,7 +121,8 @@ def summarize(
         },
     }
     if isinstance(states, MessageRecord):
-        return found | _of_network(observers, recording.fleet, states)
+        kept = ended and all(ratio < 1.0 + ROUNDING for ratio in errors)  # an error may reach its certified bound
+        return found | _of_network(observers, recording.fleet, states, kept)
     return (
         found
         if states.up is None
@@ -124,13 +130,14 @@ def summarize(
     )
 
 
-def _of_network(observers: Observers, fleet: Fleet, states: MessageRecord) -> dict[str, Any]:
+def _of_network(observers: Observers, fleet: Fleet, states: MessageRecord, kept: bool) -> dict[str, Any]:
     """What a network adds to a summary."""
     assert isinstance(observers, Networked)
     arrived = states.age[np.isfinite(states.age)]
     return {
         "network": observers.network.described(),
         "estimator": observers.estimator.name,
+        "bounds_kept": kept,
         "violations": violations(np.abs(states.error).T, states.bound.T, states.truth.T, states.layout),
         "pair_samples": states.layout.pairs * len(states.time),
         "mean_age": finite(arrived.mean()) if arrived.size else None,
