@@ -53,6 +53,27 @@ class TestNetwork:
         assert "errors above their certified bounds, start included: 0 of" in text
         assert "continuous exchange, without messages: error" in text
 
+    def test_without_certificates_it_says_why_and_nothing_of_bounds(self):
+        own = str(Path(__file__).parents[1] / "examples" / "04_your_own_agent.py")
+        found = khop("network", f"{own}:scenario", "--networks", "wifi", *SHORT).stdout
+        text = " ".join(found.split())
+        assert found.count("not certified ") >= 2
+        assert "pendulum: not certified: Pendulum.drift_growth() gives no bound" in text
+        assert "unknown" not in text
+        assert "errors above their certified bounds" not in text
+        assert "over limit" not in text
+
+    def test_a_schedule_has_no_limit_and_leaves_agents_cut_off_without_a_bound(self, folder):
+        text = khop("export", "paper").stdout
+        outage = '\n[[schedule]]\nkind = "outage"\nstart = 0.1\nduration = 9.0\nagent = 2\n'
+        (folder / "outage.toml").write_text(text + outage)
+        found = khop("network", "outage.toml", "--networks", "wifi", *SHORT).stdout
+        text = " ".join(found.split())
+        assert "no mean bound, since some agents are cut off at times by links that are down" in text
+        assert "over limit" not in text
+        assert "bound m" not in text
+        assert "errors above their certified bounds, start included: 0 of" in text
+
     def test_one_estimator_has_nothing_to_be_compared_with(self):
         found = khop("network", "paper", "--networks", "wifi", "--estimators", "relay", *SHORT)
         assert "why not" not in found.stdout

@@ -164,7 +164,19 @@ def _numbers(text: str) -> list[float]:
 
 def _print(scenario: Scenario, continuous: NetworkRow, rows: Sequence[NetworkRow], title: str) -> None:
     unit = scenario.fleet.position_unit()
-    header = ("network", "by", "per s", "loss", f"error ({unit})", "largest", "bound", "over limit", "bytes")
+    limits = any(row.bound_to_limit is not None for row in rows)
+    header = (
+        "network",
+        "by",
+        "per s",
+        "loss",
+        f"error ({unit})",
+        "largest",
+        "bound",
+        *["over limit"] * limits,
+        "bytes",
+    )
+    certified = any(row.mean_bound is not None for row in rows)
     print_table(
         header,
         [
@@ -173,31 +185,55 @@ def _print(scenario: Scenario, continuous: NetworkRow, rows: Sequence[NetworkRow
                 row.estimator,
                 _n(row.messages_per_s),
                 f"{100.0 * row.loss:.3g} %",
-                *(_n(value) for value in (row.mean_error, row.max_error, row.mean_bound, row.bound_to_limit)),
+                _n(row.mean_error),
+                _n(row.max_error),
+                _n(row.mean_bound) or "not certified",
+                *[_n(row.bound_to_limit)] * limits,
                 _n(row.bytes_per_message),
             )
             for row in rows
         ],
         title,
-        whole=("by", "per s", "loss", *header[4:8]),
+        whole=("by", "per s", "loss", *header[4:-1]),
     )
     print_text(
         "per s: messages of each agent; error, largest, bound: of positions that an agent estimates of others up to "
         f"{scenario.k} hops away, mean and largest error and mean certified bound, without the first quarter of each "
-        "episode, in which estimates start; over limit: mean bound over that of the freshest state which could have "
-        "arrived without losses (latency counts in whole periods); bytes: of the largest message, as float32"
+        "episode, in which estimates start; "
+        + "over limit: mean bound over that of the freshest state which could have arrived without losses (latency "
+        "counts in whole periods); " * limits + "bytes: of the largest message, as float32"
     )
+    for kind, reason in _uncertified(scenario, rows).items():
+        print_text(f"{kind}: {reason}")
+    bound = f"bound {_n(continuous.mean_bound)} {unit}"
+    if continuous.mean_bound is None:
+        bound = "no mean bound"
+        if scenario.schedule is not None:
+            bound = "no mean bound, since some agents are cut off at times by links that are down"
     print_text(
         f"continuous exchange, without messages: error {_n(continuous.mean_error)}, largest "
-        f"{_n(continuous.max_error)}, bound {_n(continuous.mean_bound)} {unit}"
+        f"{_n(continuous.max_error)} {unit}, {bound}"
     )
     if text := _relay_against_ppso(rows):
         print_text(text)
+    if not certified:
+        return
     violations, steps = (sum(getattr(row, key) for row in rows) for key in ("violations", "pair_steps"))
     print_text(f"errors above their certified bounds, start included: {violations} of {steps} pairs and steps")
     for row in rows:
         if row.violations:
             print_text(f"  {row.network}, {row.estimator}: {row.violations} of {row.pair_steps}")
+
+
+def _uncertified(scenario: Scenario, rows: Iterable[NetworkRow]) -> dict[str, str]:
+    """Why there is no mean bound, by type of agents."""
+    from khop_env.network import Network
+    from khop_env.results import network_report
+
+    if all(row.mean_bound is not None for row in rows):
+        return {}
+    types = network_report(scenario, Network())["types"]
+    return {each["type"]: each["reason"] for each in types if not each["certified"]}
 
 
 def _relay_against_ppso(rows: Iterable[NetworkRow]) -> str:
@@ -211,10 +247,11 @@ def _relay_against_ppso(rows: Iterable[NetworkRow]) -> str:
     longer = [_over(found["ppso"].bytes_per_message, found["relay"].bytes_per_message) for found in both]
     if not both:
         return ""
+    wider = "" if set(bounds) == {None} else f"their certified bound {_between(bounds)} times, "
     return (
         f"why not just pass states on? At the same message rate the mean error of the paper's observers (ppso) is "
-        f"{_between(errors)} times that of states passed on and predicted (relay), their certified bound "
-        f"{_between(bounds)} times, and their messages are {_between(longer)} times as long"
+        f"{_between(errors)} times that of states passed on and predicted (relay), {wider}and their messages are "
+        f"{_between(longer)} times as long"
     )
 
 

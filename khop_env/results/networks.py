@@ -50,7 +50,7 @@ class NetworkRow:
         max_error: the largest one.
         mean_bound: of the guaranteed bounds on these errors; None where they aren't certified.
         bound_to_limit: mean bound over the mean information limit, the bound of who had the freshest state that this
-            network could have brought without losses.
+            network could have brought without losses; None without certificates, or where a schedule takes links down.
         violations: pairs and steps with an error above its guaranteed bound in any state, by more than rounding.
         pair_steps: of how many: pairs times steps times episodes.
         messages_per_s: that each agent sends.
@@ -170,7 +170,8 @@ def _measured(simulator: Simulator, name: str, network: Network | None, duration
         if step > _TRANSIENT * steps:
             counted += width
             sums += [values[positions].sum() for values in (error, bound)]
-            if isinstance(observers, Networked) and step % every == 0:
+            # limits are of all links, so that there is no comparison where some are down
+            if isinstance(observers, Networked) and step % every == 0 and simulator.design.schedule is None:
                 observers.limits(simulator.state, limit)
                 compared += [values[positions].sum() for values in (bound, limit)]
             largest = max(largest, float(error[positions].max(initial=0.0)))
