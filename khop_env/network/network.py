@@ -103,7 +103,7 @@ class Network:
             return None
         if isinstance(network, Mapping):
             values = dict(network)
-            return _changed(values.pop("profile", "ideal"), values)
+            return _changed(values.pop("profile", "ideal"), values, ("profile",))
         if not isinstance(network, str):
             raise ValueError(f"a network is a name like 'wifi', a Network, a mapping or None; got {network!r}")
         name, colon, text = network.partition(":")
@@ -151,13 +151,14 @@ class Network:
         return ", ".join(parts)
 
 
-def _changed(profile: object, values: Mapping[str, object]) -> Network:
+def _changed(profile: object, values: Mapping[str, object], others: tuple[str, ...] = ()) -> Network:
+    """A profile with other values; `others` are keys that were read before, for hints."""
     if not isinstance(profile, str) or profile not in PROFILES:
         raise ValueError(f"no network {profile!r}; {did_you_mean(profile, PROFILES)}")
     known = [field.name for field in fields(Network)]
     for key in values:
         if key not in known:
-            raise ValueError(f"network {profile!r}: no key {key!r}; {did_you_mean(key, known)}")
+            raise ValueError(f"network {profile!r}: no key {key!r}; {did_you_mean(key, (*others, *known))}")
     return replace(PROFILES[profile], **values)  # type: ignore[arg-type]
 
 

@@ -37,6 +37,8 @@ def read_network(table: CheckedTable) -> dict[str, Any]:
         if key in table.names():
             with table.gathering():
                 values[key] = table.choice(key, known)
+        else:
+            table.take(key, str, None)  # known, for hints at misspelt ones
     hints = get_type_hints(Network)
     for key in (field.name for field in fields(Network)):
         value = table.take(key, hints[key], None)

@@ -50,6 +50,9 @@ def test_profiles_and_numbers(table, expected, estimator, tmp_path):
 @pytest.mark.parametrize(
     ("table", "messages"),
     [
+        ('profil = "wifi"', ["network.profil: unknown key (with the value 'wifi')", "did you mean 'profile'?"]),
+        ('estimater = "relay"', ["network.estimater: unknown key", "did you mean 'estimator'?"]),
+        ("speed = 3", ["network.speed: unknown key", "estimator, profile, period"]),
         ('profile = "wify"', ["network.profile: got 'wify', expected one of 'ideal', ", "did you mean 'wifi'?"]),
         ('estimator = "rely"', ["network.estimator: got 'rely'", "did you mean 'relay'?"]),
         ("los = 0.2", ["network.los: unknown key (with the value 0.2); did you mean 'loss'?"]),
