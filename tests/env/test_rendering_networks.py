@@ -8,8 +8,9 @@ import pytest
 
 import khop_env
 from khop_env.env.rendering import Messages, Renderer, Scene
+from khop_env.env.rendering.canvas import Canvas
 from khop_env.env.rendering.links import DOWN, FRESH, faded, stroke_of
-from khop_env.env.rendering.panel import _ages
+from khop_env.env.rendering.panel import Panel, _ages
 from khop_env.env.rendering.renderer import described
 from khop_env.network import Network, Outage
 from khop_env.observers import Networked
@@ -201,3 +202,31 @@ def test_an_environment_over_a_network_renders():
     assert renderer._estimates.targets == sorted(known)
     assert "60 % lost in bursts of 5" in renderer._network
     assert renderer._panel._estimator == "ppso"
+
+
+class TestCutOff:
+    """Continuous exchange over links that are down: a target that doesn't reach the observer has no bound."""
+
+    def test_it_has_no_box_and_the_panel_says_so(self, monkeypatch):
+        written = []
+        monkeypatch.setattr(Panel, "_note", lambda self, canvas, *lines: written.append(" ".join(lines)))
+        scenario = paper().replace(schedule=Outage(0.0, 9.0, agent=2))
+        simulator = scenario.build().reset(3)
+        for _ in range(50):  # until boxes are smaller than the view
+            simulator.step(0.1)
+        scene = Scene.of(simulator)
+        layout = simulator.observers.layout
+        observer, target = next(pair for pair in layout.slot if pair[1] == 2)
+        renderer = Renderer(simulator.design, TASK, observer=observer)
+        bounds = renderer._estimates.half_widths(scene.bounds)
+        cut_off = np.isinf(bounds).any(axis=1)
+        assert cut_off[renderer._estimates.targets.index(target)]
+        assert not cut_off.all()
+        boxes = []
+        monkeypatch.setattr(Canvas, "box", lambda self, *box: boxes.append(box))
+        renderer.frame(scene)
+        of_legend = 1
+        assert len(boxes) - of_legend == np.count_nonzero(~cut_off)
+        have = "target has" if cut_off.sum() == 1 else "targets have"
+        assert f"{cut_off.sum()} {have} no bound now, and no box" in written
+        assert not any("larger than the view" in text for text in written)

@@ -86,13 +86,16 @@ class Panel:
         self._types, self._driven, self._task, self._observer = types, driven, task, observer
         self._estimator = estimator
 
-    def draw(self, canvas: Canvas, scene: Scene, hidden: int, ages: FloatArray | None = None) -> None:
+    def draw(
+        self, canvas: Canvas, scene: Scene, hidden: int, unbounded: int = 0, ages: FloatArray | None = None
+    ) -> None:
         """Draw it.
 
         Args:
             canvas: to draw on.
             scene: of the frame.
             hidden: number of guaranteed boxes that are larger than the view.
+            unbounded: number of targets that have no bound, and so no box.
             ages: (K,) of what the observer knows of its targets, in s; None for continuous exchange.
         """
         self._line = self._top + 12 * self._unit
@@ -108,6 +111,9 @@ class Panel:
         if hidden:
             boxes = "box is" if hidden == 1 else "boxes are"
             self._note(canvas, f"{hidden} {boxes} larger", "than the view")
+        if unbounded:
+            have = "target has" if unbounded == 1 else "targets have"
+            self._note(canvas, f"{unbounded} {have} no bound", "now, and no box")
 
     def _write(
         self, canvas: Canvas, text: str, *, size: int = 13, color: str = INK, advance: float = 24, indent: float = 0

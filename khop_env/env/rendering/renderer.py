@@ -198,7 +198,9 @@ class Renderer:
         self._draw_grid(canvas)
         canvas.clip(self._map)
         self._trails.draw(canvas, scene.t, lambda points: self._pixels(points, everyone))
-        hidden = self._draw_boxes(canvas, estimated, self._estimates.half_widths(scene.bounds))
+        half = self._estimates.half_widths(scene.bounds)
+        unbounded = int(np.count_nonzero(~np.isfinite(half).all(axis=1)))
+        hidden = self._draw_boxes(canvas, estimated, half)
         if scene.decorate is not None:
             scene.decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
         self._links.draw(canvas, middles, scene)
@@ -210,7 +212,7 @@ class Renderer:
         self._draw_labels(canvas, middles, estimate_pixels)
         canvas.clip(None)
         ages = None if scene.messages is None else self._estimates.ages(scene.messages)
-        self._panel.draw(canvas, scene, hidden, ages)
+        self._panel.draw(canvas, scene, hidden, unbounded, ages)
         canvas.finish()
         return canvas
 
@@ -263,8 +265,12 @@ class Renderer:
             canvas.text(self._network, (right, top / 2), size, color=SOFT, anchor=(1.0, 0.5), room=room)
 
     def _draw_boxes(self, canvas: Canvas, estimated: FloatArray, half: FloatArray) -> int:
-        """Draw the guaranteed boxes, and return the number of boxes whose edges are all out of view."""
+        """Draw the guaranteed boxes, and return the number of boxes whose edges are all out of view.
+
+        A target with an infinite bound has no box.
+        """
         left, top, width, height = self._map
+        half = np.where(np.isfinite(half).all(axis=1, keepdims=True), half, np.nan)
         targets = np.array(self._estimates.targets, int)
         low, high = self._pixels(estimated - half, targets), self._pixels(estimated + half, targets)
         hidden = 0
