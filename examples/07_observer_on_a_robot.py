@@ -72,7 +72,11 @@ def replay(folder):
 
 
 if len(sys.argv) > 1:
-    replay(Path(sys.argv[1]))
+    recorded = Path(sys.argv[1])
+    missing = [name for name in ("summary.json", "states.parquet") if not (recorded / name).is_file()]
+    if missing:
+        sys.exit(f"{recorded} isn't the folder of a khop run: it has no {' and no '.join(missing)}")
+    replay(recorded)
 else:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "khop_env", "run", "paper", "--duration", "4", "--out", folder]

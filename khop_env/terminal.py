@@ -252,7 +252,8 @@ def _ratio(value: float | None) -> str:
 def print_design(report: Mapping[str, Any]) -> None:
     """The design report as tables."""
     one_way = report["one_way_links"]
-    edges = f"{report['edges']} links, {one_way} of them one way" if one_way else f"{report['edges']} edges"
+    edges = f"{report['edges']} {'link' if one_way else 'edge'}{'s' * (report['edges'] != 1)}"
+    edges += f", {one_way} of them one way" if one_way else ""
     print_text(
         f"{report['scenario']}: {report['agents']} agents, {edges}, k = {report['k']}, "
         f"{'with' if report['relay'] else 'without'} relay, design rule {report['design_rule']}"

@@ -30,6 +30,13 @@ def test_example_runs(path, capsys, tmp_path, monkeypatch):
     assert capsys.readouterr().out
 
 
+def test_the_replay_refuses_a_folder_without_a_run(tmp_path, monkeypatch):
+    path = ROOT / "examples" / "07_observer_on_a_robot.py"
+    monkeypatch.setattr("sys.argv", [str(path), str(tmp_path / "nofolder")])
+    with pytest.raises(SystemExit, match=r"nofolder isn't the folder of a khop run: it has no summary\.json and no st"):
+        runpy.run_path(str(path), run_name="__main__")
+
+
 def test_ci_calls_the_readmes_test_command():
     assert "\nmake test" in (ROOT / "README.md").read_text()
     assert "\nmake test" in (ROOT / ".ci" / "run").read_text()

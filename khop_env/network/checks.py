@@ -37,8 +37,9 @@ def mask_of(links: Links, graph: nx.Graph, what: str) -> np.ndarray:
     absent = sorted(edge for edge in edges if edge not in links.index)
     if absent:
         raise ValueError(
-            f"{what} has {len(absent)} links that the communication graph doesn't have, the first from {absent[0][0]} "
-            f"to {absent[0][1]}; the communication graph has all links that may ever be up: add them to it"
+            f"{what} has {len(absent)} link{'s' * (len(absent) > 1)} that the communication graph doesn't have, the "
+            f"first from {absent[0][0]} to {absent[0][1]}; the communication graph has all links that may ever be up: "
+            "add them to it"
         )
     mask = np.zeros(len(links), np.bool_)
     mask[[links.index[edge] for edge in edges]] = True

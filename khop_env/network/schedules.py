@@ -261,10 +261,13 @@ class Outage(Schedule):
         if self.agent is not None and self.link is not None:
             raise ValueError("Outage: give an agent or a link, not both; `&` joins two outages")
         if self.agent is not None and not is_index(self.agent):
-            raise ValueError(f"Outage.agent must be an agent's index; got {self.agent!r}")
+            raise ValueError(f"Outage.agent must be an agent's index{_no_ids(self.agent)}; got {self.agent!r}")
         if self.link is not None:
             if not isinstance(self.link, Sequence) or len(self.link) != 2 or not all(map(is_index, self.link)):
-                raise ValueError(f"Outage.link must be two agents (sender, receiver); got {self.link!r}")
+                ids = _no_ids(*self.link) if isinstance(self.link, tuple | list) else ""
+                raise ValueError(
+                    f"Outage.link must be the indices of two agents (sender, receiver){ids}; got {self.link!r}"
+                )
             object.__setattr__(self, "link", (int(self.link[0]), int(self.link[1])))
 
     def part(self, links: Links, positions: IndexArray, number: int) -> Part:
@@ -278,6 +281,12 @@ class Outage(Schedule):
         link = -1 if self.link is None else links.index[self.link]
         agent = -1 if self.agent is None else self.agent
         return Off(links, number, (early, late - early), (short, long - short), agent, link)
+
+
+def _no_ids(*values: object) -> str:
+    """A hint where agents were named."""
+    names = [value for value in values if isinstance(value, str)]
+    return f" (a schedule doesn't know ids: scenario.fleet.agent({names[0]!r}) is the index)" if names else ""
 
 
 SCHEDULES: dict[str, type[Schedule]] = {

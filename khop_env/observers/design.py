@@ -217,7 +217,8 @@ class ObserverDesign:
         if rule == "paper" and one_way:
             sender, receiver = (fleet.ids[i] for i in one_way[0])
             raise DesignError(
-                f'design_rule = "paper" needs symmetric matrices M_i, and {len(one_way)} links go one way, the first '
+                f'design_rule = "paper" needs symmetric matrices M_i, and '
+                f"{len(one_way)} link{' goes' if len(one_way) == 1 else 's go'} one way, the first "
                 f'from {sender!r} to {receiver!r}; take design_rule = "sharp", or links both ways'
             )
         options = self.targets or [TargetObservers(input_observer=not m.input_map_uses_state) for m in fleet.models]

@@ -22,6 +22,8 @@ from typing import get_args
 
 import numpy as np
 
+from khop_env.network.checks import positive
+from khop_env.network.reading import number
 from khop_env.observers.base import SolveError
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.fingerprint import fingerprint
@@ -90,13 +92,12 @@ class ObserverNode:
         fleet = design.fleet
         check_choice("estimator", estimator, get_args(EstimatorName))
         check_choice("dtype", dtype, get_args(NumberFormat))
-        if not 0.0 < period < math.inf:
-            raise ValueError(f"period must be positive and finite, in s; got {period!r}")
-        if step is not None and not 0.0 < step <= period * (1.0 + 1e-9):
+        positive(period, "period", "s")
+        if step is not None and not 0.0 < number(step, "step") <= period * (1.0 + 1e-9):
             raise ValueError(
                 f"step, between two updates, must be positive and at most the period {period:g} s; got {step}"
             )
-        if not 0.0 <= skew < math.inf:
+        if not 0.0 <= number(skew, "skew") < math.inf:
             raise ValueError(f"skew must be finite and not negative, in s; got {skew!r}")
         if sampled and skew > 0.0:
             raise ValueError(f"a sampled system has one clock: skew must be 0 with sampled=True; got {skew!r}")
@@ -326,14 +327,14 @@ class ObserverNode:
         return self._largest[self._design.fleet.state_slice(i)]
 
     def _since(self, t: float, what: str) -> float:
-        if not (math.isfinite(t) and t >= self.time):
+        if not (math.isfinite(number(t, f"node of {self.id!r}: the time of {what}")) and t >= self.time):
             raise ValueError(
                 f"node of {self.id!r}: {what} at t = {t!r}; expected {self.time!r} s, the last time, or later"
             )
         return t - self.time
 
     def _own(self, what: str, value: FloatArray, names: tuple[str, ...]) -> FloatArray:
-        found = np.array(value, np.float64)
+        found = _numbers(value)
         if found.shape != (len(names),) or not np.isfinite(found).all():
             raise ValueError(
                 f"node of {self.id!r}: its {what} must be {len(names)} finite numbers {names}; got {value!r}"
@@ -341,9 +342,17 @@ class ObserverNode:
         return found
 
 
+def _numbers(value: object) -> FloatArray:
+    """A copy of an array of numbers; nan where it is none, which every check refuses."""
+    try:
+        return np.array(value, np.float64)
+    except (TypeError, ValueError):
+        return np.array(math.nan)
+
+
 def _of_fleet(design: ObserverDesign, name: str, value: FloatArray | float, signed: bool = False) -> FloatArray:
     """A value (n,) of the whole fleet."""
-    found, n = np.asarray(value, np.float64), design.fleet.n
+    found, n = _numbers(value), design.fleet.n
     if found.shape not in ((), (n,)) or not (np.isfinite(found) if signed else found >= 0.0).all():
         sign = "finite" if signed else "not negative"
         raise ValueError(f"{name} must be a number or {n} numbers, of the whole fleet's states, {sign}; got {value!r}")

@@ -209,7 +209,16 @@ class TestAsUsersWriteThem:
             (lambda: Outage(-1.0, 1.0), r"Outage.start must be finite and not negative, in s; got -1"),
             (lambda: Outage(1.0, np.inf), r"Outage.duration must be finite"),
             (lambda: Outage(1.0, 1.0, agent=1, link=(0, 1)), r"give an agent or a link, not both"),
-            (lambda: Outage(1.0, 1.0, link=(0, 1, 2)), r"Outage.link must be two agents"),
+            (lambda: Outage(1.0, 1.0, link=(0, 1, 2)), r"Outage.link must be the indices of two agents"),
+            (
+                lambda: Outage(1.0, 1.0, agent="drifter_0"),
+                r"Outage.agent must be an agent's index \(a schedule doesn't know ids: "
+                r"scenario.fleet.agent\('drifter_0'\) is the index\); got 'drifter_0'",
+            ),
+            (
+                lambda: Outage(1.0, 1.0, link=("a_0", "a_1")),
+                r"\(a schedule doesn't know ids: .*'a_0'.*got \('a_0', 'a_1'",
+            ),
             (lambda: Switching((RING,)), r"give the period of a cycle, or the times"),
             (lambda: Switching((RING, RING), times=(0.0,)), r"times must be 2 numbers, one for each graph"),
             (lambda: Switching((RING, RING), 2.0, (0.0, 2.0)), r"ascend from 0, below the period of 2 s"),
@@ -231,6 +240,8 @@ class TestAsUsersWriteThem:
                 r"Fixed.graph has 2 links that .* first from 0 to 3; .*add them to it",
             ),
             (Switching((RING,), 1.0), ONE_WAY, r"Switching.graphs\[0\] has 6 links .* the first from 0 to 5"),
+            (Fixed(nx.Graph([(0, 2)]).to_directed()), RING, r"Fixed.graph has 2 links that the"),
+            (Fixed(nx.DiGraph([(0, 2)])), RING, r"Fixed.graph has 1 link that the communication graph doesn't have"),
             (Outage(0.0, 1.0, agent=6), RING, r"Outage.agent must be from 0 to 5; got 6"),
             (Outage(0.0, 1.0, link=(1, 0)), ONE_WAY, r"the communication graph has no link from 1 to 0"),
             (RandomLinks(0.5, connected=True), ONE_WAY, r"links that go one way, out of which no connected graph"),

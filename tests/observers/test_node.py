@@ -258,6 +258,9 @@ def test_what_cannot_be_right_is_refused_and_changes_nothing() -> None:
         (lambda: node.receive(recorded(design, "ppso", 1)[0][1]), "runs the estimator 'ppso', this node 'relay'"),
         (lambda: node.receive(rounded), "sent float16, but this node's bounds allow for float64"),
         (lambda: node.update(T, np.zeros(3), np.zeros(2)), "its state must be 4 finite numbers"),
+        (lambda: node.update(T, "abcd", np.zeros(2)), "its state must be 4 finite numbers"),
+        (lambda: node.update("soon", np.zeros(4), np.zeros(2)), "the time of update must be a number; got 'soon'"),
+        (lambda: node.estimates(None), "must be a number; got None"),
         (lambda: node.update(T, np.zeros(4), [0.0, np.nan]), "its input must be 2 finite numbers"),
         (lambda: node.update(-T, np.zeros(4), np.zeros(2)), "expected 0.0 s, the last time, or later"),
         (lambda: node.update(math.nan, np.zeros(4), np.zeros(2)), "expected 0.0 s, the last time, or later"),
@@ -279,6 +282,14 @@ def test_bad_arguments_are_refused() -> None:
     design = design_of([SingleIntegrator()] * 3)
     for arguments, message in (
         ({"period": 0.0}, "period must be positive"),
+        ({"period": "a"}, "period must be a number; got 'a'"),
+        ({"period": T, "step": "a"}, "step must be a number; got 'a'"),
+        ({"period": T, "skew": None}, "skew must be a number; got None"),
+        (
+            {"period": T, "noise": "a"},
+            "noise must be a number or .* numbers, of the whole fleet's states, not negative",
+        ),
+        ({"period": T, "center": [[1], [1, 2]]}, "center must be a number or .* finite; got"),
         ({"period": T, "step": 2 * T}, "step, between two updates, must be positive and at most the period 0.05 s"),
         ({"period": T, "estimator": "pps"}, "estimator must be one of ppso, relay; got 'pps', did you mean 'ppso'"),
         ({"period": T, "dtype": "float8"}, "dtype must be one of float64, float32, float16"),
