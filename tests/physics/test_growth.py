@@ -117,6 +117,23 @@ def test_ships_never_leave_their_operating_region(seed: int) -> None:
     assert (largest / region)[3:].max() > 0.5  # and it isn't far off
 
 
+@pytest.mark.parametrize("step", [0.05, 0.2])
+def test_ships_in_euler_steps_stay_in_their_operating_region(step: float) -> None:
+    """Measured: an Euler step adds energy, which the region, derived for continuous time, doesn't count."""
+    rng, vessel, ships = np.random.default_rng(0), SurfaceVessel(), 400
+    w, start = np.array([0, 0, 0, 0.1, 0.1, 0.1]), np.array([0, 0, 0, 0.2, 0.2, 0.1])
+    region = vessel.operating_region(start, w)[3:]
+    x, t = start * np.sign(rng.uniform(-1, 1, (ships, 6))), np.zeros(ships)
+    random, raising, largest = np.sign(rng.uniform(-1, 1, (ships, 3))), np.arange(ships) < ships // 2, np.zeros(3)
+    for _ in range(round(20.0 / step)):
+        random[rng.random(random.shape) < 0.5 * step] *= -1  # every two seconds
+        direction = np.where(raising[:, None], np.where(x[:, 3:] < 0.0, -1.0, 1.0), random)
+        push = np.concatenate([np.zeros((ships, 3)), w[3:] * direction], axis=1)
+        x = x + step * (vessel.drift(t, x) + vessel.input_map(t, x, vessel.input_limit * direction) + push)
+        largest = np.maximum(largest, np.abs(x[:, 3:]).max(axis=0))
+    assert 0.5 < (largest / region).max() < 0.9
+
+
 def test_a_ship_in_one_direction_reaches_its_region() -> None:
     """With much drag elsewhere the region is the speed at which drag balances the force."""
     vessel = SurfaceVessel(linear_drag=(2.0, 1e3, 1e3), quadratic_drag=(3.0, 1.0, 1.0), input_limit=(5.0, 1e-9, 1e-9))
