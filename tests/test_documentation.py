@@ -6,6 +6,7 @@ import inspect
 import pkgutil
 import re
 import types
+from pathlib import Path
 from typing import Protocol
 
 import pytest
@@ -13,6 +14,7 @@ import pytest
 import agents
 import khop_env
 
+ROOT = Path(__file__).parents[1]
 PACKAGES = ["agents", "khop_env"] + [
     f"{package.__name__}.{found.name}"
     for package in (agents, khop_env)
@@ -131,3 +133,11 @@ def test_methods_explain_their_arguments(name: str) -> None:
         if missing := lacking(" ".join(texts), arguments(function), few=3):
             poor[method] = missing
     assert not poor
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name
+)
+def test_pages_have_no_placeholders(page):
+    found = re.findall(r"@[A-Z]+@", page.read_text(encoding="utf-8"))
+    assert not found, f"{page.name}: {found} were to be replaced by what was measured"
