@@ -11,6 +11,7 @@ from khop_env.network import Network
 from khop_env.observers import Exponential, Message, Networked
 from khop_env.physics import SingleIntegrator
 from khop_env.results import measure_networks, network_figure
+from khop_env.results.curves import _largest_error
 from khop_env.results.metrics import violations
 from khop_env.results.network_report import expected_age, network_report
 from khop_env.results.networks import SWEPT_LOSSES, SWEPT_PERIODS, sweeps
@@ -160,6 +161,15 @@ def test_the_figure_shows_both_estimators_at_all_periods_and_losses(tmp_path):
     losses = [dataclasses.replace(row, loss=loss) for loss in SWEPT_LOSSES]
     path = network_figure(rows, losses, row, tmp_path / "network.png", "a title")
     assert path.stat().st_size > 20_000
+
+
+def test_a_largest_error_above_the_mean_bound_is_no_violation():
+    (row,) = measured(["wifi"], ["relay"], duration=0.2)
+    uncertified = dataclasses.replace(row, mean_bound=None)
+    assert "no error is\nabove its own bound" in _largest_error([row, uncertified])
+    assert _largest_error([uncertified]) == "largest error"
+    wrong = _largest_error([row, dataclasses.replace(row, violations=3)])
+    assert "(3 errors\nare above their own bounds)" in wrong
 
 
 class TestReport:
