@@ -222,6 +222,7 @@ def test_evaluate_over_a_network():
     assert "its certified bound (at most 1 by guarantee)" in text
     assert "below 1 by guarantee" not in text
     assert "|xi|" not in text  # relay has no disagreements
+    assert "|e|" not in text
     text = " ".join(khop("evaluate", "consensus_v0", *options, "--network", "wifi").stdout.split())
     assert "|e|: largest |xi| / rho of what agents hold" in text
     found = only_json(khop("evaluate", "consensus_v0", *options, "--network", "wifi", "--estimator", "relay", "--json"))

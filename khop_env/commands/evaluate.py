@@ -139,12 +139,13 @@ def print_comparison(comparison: Comparison) -> None:
                 f"{seen['final_task_error']:.3g}",
                 "never" if settling is None else f"{settling:.3g}",
                 f"{seen['effort']:.3g}",
-                "" if no_disagreement else f"{seen['max_normalized_disagreement']:.3f}",
+                *[f"{seen['max_normalized_disagreement']:.3f}"] * (not no_disagreement),
                 f"{seen['max_error_to_bound']:.3f}",
             )
         )
     unit = comparison.rows[0].env.error_unit
-    header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", "|e|", "e / bound")
+    ratios = ("e / bound",) if no_disagreement else ("|e|", "e / bound")
+    header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", *ratios)
     where = f"{comparison.environment} on {comparison.scenario}"
     if networked:
         where += f" over a network ({comparison.network}), estimator {comparison.estimator}"
