@@ -33,7 +33,7 @@ def folder(tmp_path, monkeypatch):
 
 def test_an_environment_by_name():
     result = khop("test", "consensus_v0", "--scenario", "paper", "--steps", "20")
-    assert "consensus_v0: 15 passed, 0 failed, 1 skipped" in result.stdout
+    assert "consensus_v0: 16 passed, 0 failed, 1 skipped" in result.stdout
     assert max(map(len, result.stdout.splitlines())) <= 80
 
 
