@@ -170,7 +170,7 @@ def play(
 
 def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Episodes:
     """Run one batch of episodes and keep the first `count`."""
-    horizon, period = env.settings.max_cycles, env.settings.control_period
+    horizon, period = env.settings.horizon, env.settings.control_period
     error, returns, effort = np.zeros((horizon + 1, env.num_envs)), np.zeros(env.num_envs), np.zeros(env.num_envs)
     worst, late, bound = (np.zeros(env.num_envs) for _ in range(3))
     inputs = np.array([env.fleet.models[env.fleet.agent(agent)].m for agent in env.agents])

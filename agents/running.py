@@ -53,7 +53,7 @@ class PolicyRun:
     def duration(self) -> float:
         """Length of the episode in s."""
         settings = self.env.batched.settings
-        return settings.max_cycles * settings.control_period
+        return settings.horizon * settings.control_period
 
     @property
     def extremes(self) -> Extremes:
@@ -141,13 +141,15 @@ def environment_for(spec: str, scenario: Scenario) -> str:
         scenario: where it acts.
 
     Returns:
-        What a learned policy was trained for; for others the environment of the scenario's law, or consensus.
+        What a learned policy was trained for; for others the environment that it is the default policy of, that of the
+        scenario's law, or consensus.
 
     Raises:
         ValueError: if a learned policy was trained for a task that isn't of the library.
     """
     of_law = f"{scenario.law.name}_v0"
-    other = of_law if of_law in environments() else "consensus_v0"
+    of_policy = [name for name in environments() if find_task(name).default_policy == spec.partition(":")[0]]
+    other = of_policy[0] if of_policy else of_law if of_law in environments() else "consensus_v0"
     found: str = _training(make_policy(spec), None, scenario).get("environment", other)
     if found not in environments():
         raise ValueError(

@@ -31,13 +31,14 @@ def evaluate(
     environment: EnvironmentArgument,
     scenario: EnvironmentScenario = None,
     policies: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
-            "classes of your own, my_file.py:MyPolicy."
+            "go_to_goal in navigation_v0; classes of your own, my_file.py:MyPolicy. By default tanh, linear, zero and "
+            "random, or go_to_goal, zero and random."
         ),
-    ] = "tanh,linear,zero,random",
+    ] = None,
     observe: Annotated[
         str, typer.Option(help="Observation modes: estimate, oracle (true states), local (neighbours only).")
     ] = "estimate,oracle,local",
@@ -67,14 +68,16 @@ def evaluate(
         if csv and as_json:
             raise ValueError("--csv and --json: choose one of them")
         require_figure(figure)
-        arguments = environment_arguments(env, find_task(environment), {"observe": "--observe"})
+        task = find_task(environment)
+        default = f"{task.default_policy or 'tanh,linear'},zero,random"
+        arguments = environment_arguments(env, task, {"observe": "--observe"})
         arguments = with_network(arguments, network, estimator)
         chosen = None if scenario is None else load(scenario)
         with Progress(f"playing {environment}") as progress:
             try:
                 comparison = compare(
                     environment,
-                    split_specs(policies, "--policies", "policy"),
+                    split_specs(policies or default, "--policies", "policy"),
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
                     scenario=chosen,
                     arguments=arguments,

@@ -11,7 +11,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from khop_env import make_sb3_vec, make_vec
-from tests.env.playing import EVERY, INFO_KEYS, built, same
+from tests.env.playing import EVERY, built, info_keys, same
 
 COPIES = 2
 
@@ -46,10 +46,10 @@ def test_rows_are_those_of_the_gymnasium_environment(environment, name):
             if not dones[row]:
                 assert info == {}
                 continue
-            assert set(info) == {"terminal_observation", "TimeLimit.truncated", "episode", *INFO_KEYS}
+            assert set(info) == {"terminal_observation", "TimeLimit.truncated", "episode", *info_keys(environment)}
             assert info["terminal_observation"].tobytes() == infos_2["final_obs"][row].tobytes()
             assert info["TimeLimit.truncated"] is bool(truncated[row])
-            for key in INFO_KEYS:
+            for key in info_keys(environment):
                 assert info[key] == infos_2["final_info"][key][row]
 
 
