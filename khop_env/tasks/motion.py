@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from khop_env.compiled import compiled
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, IntArray
 
 
 @compiled
@@ -83,3 +83,11 @@ def lower_distances(
                     obstacles[m, 3],
                 )
                 clearance[i, env] = min(clearance[i, env], distance - obstacles[m, 4])
+
+
+@compiled
+def add_squares(owner: IntArray, inputs: FloatArray, out: FloatArray) -> None:
+    """Add to `out` (N, B) the squares of the inputs (m, B) that belong to each agent, by `owner` (m,)."""
+    for column in range(owner.size):
+        for env in range(inputs.shape[1]):
+            out[owner[column], env] += inputs[column, env] * inputs[column, env]

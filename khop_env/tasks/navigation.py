@@ -14,7 +14,7 @@ from khop_env.observers import FloatArray, IntArray
 from khop_env.simulation import Arena
 from khop_env.tasks.base import Column, MapCanvas, Outcome, Signature, Task, World
 from khop_env.tasks.edges import NUMBER, Reward, axis_names, require_positive
-from khop_env.tasks.motion import lower_distances
+from khop_env.tasks.motion import add_squares, lower_distances
 
 MOST_OBSTACLES = 3  # in an observation
 DISC, COLLIDED, GOAL, OBSTACLE, ARROW = "#8899aa", "#cc3311", "#666666", "#999999", "#ee7733"
@@ -95,8 +95,7 @@ class Navigation(Task):
             "clearance": np.zeros((len(fleet), world.num_envs)),
             "reached": np.zeros((len(fleet), world.num_envs)),  # 1 if it had arrived before this control period
         }
-        owner = np.concatenate([[i] * fleet.models[i].m for i in range(len(fleet))]).astype(int)
-        self._inputs_of = (owner == np.arange(len(fleet))[:, None]).astype(float)  # (N, m)
+        self._input_owner = np.repeat(np.arange(len(fleet)), [model.m for model in fleet.models])
 
     def columns(self, world: World, agent: int) -> Sequence[Column]:
         """Goal and the nearest points of the nearest obstacles, relative to the agent, and the agents' radius."""
@@ -175,11 +174,13 @@ class Navigation(Task):
         distance = self._distance(world.positions())
         arrived = (distance <= self.goal_radius).astype(float)
         cost = ((memory["nearest"] < 2.0 * radius) | (memory["clearance"] < radius)).astype(float)
-        effort = self._inputs_of @ np.square(world.inputs)
+        effort = np.zeros(distance.shape)
+        add_squares(self._input_owner, world.inputs, effort)
         reward = self._distance(memory["before"]) - distance - world.control_period * self.effort * effort
         reward += self.bonus * arrived * (1.0 - memory["reached"]) - self.penalty * cost
+        reward = reward.T.copy()  # in this order a mean has the same bits for any number of environments
         if self.reward == "team":
-            reward[...] = reward.mean(axis=0)
+            reward[...] = reward.mean(axis=1, keepdims=True)
         terminated = np.asarray(arrived.all(axis=0))
         if self.end_at_collision:
             terminated |= cost.any(axis=0)
@@ -190,9 +191,7 @@ class Navigation(Task):
             "min_distance": memory["nearest"],
             "obstacle_distance": memory["clearance"],
         }
-        return Outcome(
-            np.ascontiguousarray(reward.T), terminated, {name: each.T.copy() for name, each in infos.items()}
-        )
+        return Outcome(reward, terminated, {name: each.T.copy() for name, each in infos.items()})
 
     def signature(self, world: World) -> Signature:
         """Name, agents' size, goals and obstacles."""

@@ -7,7 +7,7 @@ from agents import LAWS, LawPolicy, describe, make_law, make_policy, play
 from agents.policy import by_agent
 from khop_env.scenarios import LawChoice
 from khop_env.simulation import View
-from tests.env.playing import ALONG_EDGES, CROSS, EVERY_ALONG_EDGES, MODES, batched, parallel
+from tests.env.playing import ALONG_EDGES, CROSS_ALONG_EDGES, EVERY_ALONG_EDGES, MODES, batched, parallel
 
 PARAMETERS = {  # all of them, so that no shipped ones are used
     "tanh": {"gain": 1.3},
@@ -43,7 +43,7 @@ def true_view(env):
     return View(acting, own, np.array(edges), np.tile(known, (len(own), 1)), columns.transpose(2, 0, 1)), acting
 
 
-@pytest.mark.parametrize(("environment", "scenario", "observe", "uniform"), CROSS)
+@pytest.mark.parametrize(("environment", "scenario", "observe", "uniform"), CROSS_ALONG_EDGES)
 @pytest.mark.parametrize("law", LAWS)
 def test_a_policy_does_what_its_law_does(environment, scenario, observe, uniform, law):
     """Reading observations by name gives the law what the simulator's arrays hold, to float32."""

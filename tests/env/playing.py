@@ -26,6 +26,7 @@ EVERY = list(itertools.product(ENVIRONMENTS, SCENARIOS))
 CROSS = list(itertools.product(ENVIRONMENTS, SCENARIOS, MODES, (True, False)))  # ..., observe, uniform
 ALONG_EDGES = tuple(name for name in ENVIRONMENTS if issubclass(find_task(name), EdgeTask))
 EVERY_ALONG_EDGES = list(itertools.product(ALONG_EDGES, SCENARIOS))
+CROSS_ALONG_EDGES = [each for each in CROSS if each[0] in ALONG_EDGES]
 IDS = {name: gymnasium_id(name) for name in ENVIRONMENTS}
 
 

@@ -1,5 +1,6 @@
 """Navigation: collisions found exactly, rewards and costs as documented, starts and goals that are far enough apart."""
 
+import functools
 import importlib
 import math
 
@@ -13,6 +14,7 @@ from khop_env.physics import SingleIntegrator
 from khop_env.scenarios.files import ScenarioFileError, read_scenario, write_scenario
 from khop_env.scenarios.teams import TEAM_MODELS
 from khop_env.tasks.motion import lower_distances, segment_to_segment
+from khop_env.testing import check_environment
 
 FAMILIES = ("swap", "crossing", "corridor")
 SHORTEST = {"swap": 0.5, "crossing": 1.0, "corridor": 1.0}  # m between starting points
@@ -342,3 +344,12 @@ def test_laws_have_nothing_to_act_along():
         make_policy("tanh").reset(describe(module.parallel_env()), [0])
     with pytest.raises(ValueError, match=r"go_to_goal needs an environment with goals, e.g. navigation_v0"):
         make_policy("go_to_goal").reset(describe(consensus_v0.parallel_env()), [0])
+
+
+def test_the_contract_is_kept_over_a_network_and_among_obstacles():
+    """Spaces, seeds, copies, pickles, vector rows, leaks, and the checks of PettingZoo, Gymnasium and SB3."""
+    report = check_environment(
+        functools.partial(navigation_v0.parallel_env, "corridor:agents=4", max_cycles=20), steps=30
+    )
+    report.raise_if_failed()
+    assert {check.status for check in report.checks} == {"passed"}
