@@ -33,7 +33,7 @@ class CostsApart(BaseParallelWrapper[str, Float32Array, Float32Array]):
     def __init__(self, env: KHopEnv) -> None:
         super().__init__(env)
 
-    def step(self, actions: Mapping[str, Float32Array]) -> CostStep:  # type: ignore[override]
+    def step(self, actions: Mapping[str, Float32Array]) -> CostStep:
         """One control period; costs by agent stay in the infos, too.
 
         Args:

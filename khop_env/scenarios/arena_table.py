@@ -32,7 +32,7 @@ def read_arena(table: CheckedTable) -> Arena:
             )
             continue
         with table.built(f"obstacles[{number}]"):
-            obstacles.append(Obstacle(row[:2], row[2:4] if len(row) == 5 else None, row[-1]))  # type: ignore[arg-type]
+            obstacles.append(Obstacle(row[:2], row[2:4] if len(row) == 5 else None, row[-1]))
     table.finish()
     with table.built():
         return Arena(radius, apart, goals, tuple(obstacles))
