@@ -19,6 +19,8 @@ from khop_env.results.recording import StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
 
+ARROW_TIME = 0.5  # s: frames show a filter's correction of a velocity as the way of this time
+
 
 class PolicyRun:
     """Stands in for a simulator in `results.record`: its steps are control periods of an environment with a policy.
@@ -75,6 +77,8 @@ class PolicyRun:
             StoppedError: if the policy fails, or its actions are refused.
         """
         actions: Mapping[str, Any] = self._guarded(self.policy.act, self._observations)
+        if correction := getattr(self.policy, "correction", None):  # a filter's, by agent in m/s, for frames
+            self.env.batched.world.arrows = ARROW_TIME * np.stack(list(correction.values()))[..., None]
         self._observations, rewards, *_ = self._guarded(self.env.step, actions)
         self.episode_return += float(np.mean(list(rewards.values())))
         for running, now in zip(self._extremes, self.simulator.extremes, strict=True):

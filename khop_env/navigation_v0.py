@@ -73,8 +73,20 @@ neighbours are estimated, too, and slots say how old the information is that an 
 With `observe="oracle"` all slots have true states and are valid; with `observe="local"` neighbours are estimated from
 messages, and the slots of k-hop targets are zeros.
 
-Without a network, but with links that come and go (`Scenario.schedule`), the state of a neighbour whose link is down is
-zeros in its slot, and `valid`, `heard` and `hops` are 0; estimates of k-hop targets go on.
+With links that come and go (`Scenario.schedule`) and no network, a neighbour's state is received while its link is up.
+Slots of k-hop targets hold their estimates all the time, which are predictions while an agent is cut off. With
+`observe="oracle"` all slots have true states and are valid.
+
+| Columns                     | Content where links come and go, without a network                                |
+|-----------------------------|-----------------------------------------------------------------------------------|
+| slot0.valid                 | 0 for a neighbour whose link is down: its state is zeros; what is constant stays  |
+| slot0.heard                 | 1 if the agent is a neighbour whose link is up                                    |
+| slot0.bound.<state>         | the guaranteed bound for the links that are up now, the largest value for none    |
+
+Without relays (`relay = false`) neighbours are estimated, too: while its link is down a neighbour's slot holds the
+estimate, with its bound, and is valid (zeros under `observe="local"`). These bounds follow from the whole graph at that
+instant, which no agent knows: they are meant for evaluation. Under a network certified bounds use only what was
+received.
 
 ### Action Space
 
