@@ -45,8 +45,8 @@ class Episodes:
         time: (T + 1,) in s.
         outcomes: (E,) each, where agents may collide: "collision" and "success" (all at their goals, and no collision),
             0 or 1; "arrival_time", mean over the agents in s, nan if not all are at their goals at the end;
-            "min_distance" of two agents in m; "deadlock", 1 if at the end of the horizon nobody who isn't at the goal
-            has moved by more than 0.1 m in 2 s; "intervention", mean over agents and time of a filter's changes of
+            "min_distance" of two agents in m; "deadlock", 1 if not all are at their goals at the end and nobody has
+            moved by 0.1 m in the last 2 s; "intervention", mean over agents and time of a filter's changes of
             their inputs in m/s, nan without a filter. Nothing in other environments.
     """
 

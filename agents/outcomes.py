@@ -81,7 +81,7 @@ class Outcomes:
         values["success"] = np.where(ended, everybody & (values["collision"] == 0.0), values["success"])
         if len(self._places) == self._places.maxlen:
             moved = np.sqrt(((self._places[-1] - self._places[0]) ** 2).sum(axis=1)).T  # (B, N)
-            still = (arrived | (moved < STILL)).all(axis=1) & ~everybody
+            still = (moved < STILL).all(axis=1) & ~everybody
             values["deadlock"] = np.where(ended, still, values["deadlock"])
 
     def result(self) -> dict[str, FloatArray]:

@@ -200,7 +200,7 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
     print_table((*header, "e / bound"), rows, title)
     print_text(
         "collided: episodes with a collision; success: all at their goals at the end, without any collision; deadlock: "
-        "not all at their goals, and the others haven't moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals. "
+        "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals. "
         "time: until an agent's first arrival, mean over agents and successful episodes; distance: smallest of two "
         "agents' centres; changed: by a filter, of each agent's inputs, mean over time; return: mean over agents of an "
         "episode's sum, 95 % interval; e / bound: largest estimation error over its bound (below 1 by guarantee)"
