@@ -184,9 +184,8 @@ def compare(
         raise ValueError(f"networks must be names, and arguments without a network then; got networks={networks!r}")
     player = _Player(environment, chosen_scenario(environment, scenario), arguments or {})
     rows: list[tuple[str, EnvDescription, bool, str | None]] = []
-    for spec, network in itertools.product(
-        policies, networks or (None,)
-    ):  # check that each policy fits before the first episode
+    # check that each policy fits before the first episode
+    for spec, network in itertools.product(policies, networks or (None,)):
         policy = make_policy(spec)
         bounds = isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
         for mode in observe:

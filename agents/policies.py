@@ -7,7 +7,7 @@ from typing import get_type_hints
 from agents.laws import LAWS
 from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
-from agents.navigation import GoToGoal
+from agents.navigation import GoToGoal, KeepRight
 from agents.policy import Policy
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
 from khop_env.objects import called, is_object_name, load_object
@@ -19,6 +19,7 @@ FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy] | type[GoToGoal]] = {
     "random": RandomPolicy,
     "bang_bang": BangBangPolicy,
     "go_to_goal": GoToGoal,
+    "keep_right": KeepRight,
 }
 POLICIES = (*LAWS, *FLOOR)
 """Names of the scripted policies."""

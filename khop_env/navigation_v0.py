@@ -132,7 +132,7 @@ from khop_env import navigation_v0
 
 navigation_v0.parallel_env(scenario="crossing", observe="estimate", bounds=False, uniform=True, max_cycles=None,
 control_period=0.05, dt=None, order=1, actuator="direct", reward="agent", effort=0.01, bonus=1.0, penalty=0.0,
-goal_radius=0.1, end_at_collision=False, limit=100.0, threads=1, network=None, estimator=None, render_mode=None)
+goal_radius=0.2, end_at_collision=False, limit=100.0, threads=1, network=None, estimator=None, render_mode=None)
 ```
 
 `scenario`: a name (`khop list`), one with parameters ("random_geometric:agents=12"), a path that ends in .toml, or a
@@ -166,7 +166,7 @@ requires (Assumption 2-ii of the paper)
 
 `penalty`: taken from the reward in every control period in which the agent has collided, in m (default 0)
 
-`goal_radius`: distance to the goal up to which an agent has arrived, in m (default 0.1)
+`goal_radius`: distance to the goal up to which an agent has arrived, in m (default 0.2, the radius of its disc)
 
 `end_at_collision`: whether the first collision terminates the episode (default False)
 

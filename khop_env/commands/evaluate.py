@@ -34,8 +34,8 @@ def evaluate(
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
-            "go_to_goal in navigation_v0; classes of your own, my_file.py:MyPolicy. By default tanh, linear, zero and "
-            "random, or go_to_goal, zero and random."
+            "go_to_goal and keep_right in navigation_v0; classes of your own, my_file.py:MyPolicy. By default tanh, "
+            "linear, zero and random, or go_to_goal, zero and random."
         ),
     ] = None,
     observe: Annotated[

@@ -62,7 +62,7 @@ class Navigation(Task):
     effort: float = 0.01
     bonus: float = 1.0
     penalty: float = 0.0
-    goal_radius: float = 0.1
+    goal_radius: float = 0.2
     end_at_collision: bool = False
 
     def __post_init__(self) -> None:

@@ -126,6 +126,48 @@ def test_going_straight_arrives_at_the_limit_of_speed(family, model):
         assert (first < distance + 1.0).all()
 
 
+def test_keeping_right_lets_pass():
+    """Two that meet head-on pass each other on the right, where those that go straight collide."""
+    found = {}
+    for name in ("go_to_goal", "keep_right"):
+        env = navigation_v0.parallel_env(wide(), observe="oracle", goal_radius=0.1)
+        places = np.array([[-2.0, 0.0], [2.0, 0.0], [4.0, 3.0], [-5.0, 3.0]])
+        env.reset(seed=0, options={"initial_state": places.ravel()})
+        env.batched.task.memory["goal"][..., 0] = places[[1, 0, 2, 3]]
+        policy = make_policy(name)
+        policy.reset(describe(env), [0])
+        observations = {agent: env.observe(agent) for agent in env.agents}
+        sides, cost = [], 0.0
+        while env.agents:
+            observations, _, terminated, _, infos = env.step(policy.act(observations))
+            cost += infos["integrator_0"]["cost"]
+            sides.append(env.batched.world.positions()[:2, 1, 0])
+        assert all(terminated.values())
+        found[name] = cost, np.array(sides)
+    assert found["go_to_goal"][0] > 0.0
+    assert found["keep_right"][0] == 0.0
+    assert found["keep_right"][1].min(axis=0)[0] < -0.1  # the one that goes to the right of the map keeps below
+    assert found["keep_right"][1].max(axis=0)[1] > 0.1
+
+
+def test_who_is_stuck_goes_aside_and_comes_back():
+    """An agent whose inputs don't move it tries another direction after a second, which the seed decides."""
+    env = lane()
+    observed = {agent: env.observe(agent) for agent in env.agents}
+    first, again, other = ([], [], [])
+    for actions, seed in ((first, 3), (again, 3), (other, 4)):
+        policy = make_policy("keep_right")
+        policy.reset(describe(env), [seed])
+        actions += [policy.act(observed)["integrator_2"] for _ in range(120)]
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    wished = first[0]
+    aside = [not np.allclose(action, wished) for action in first]
+    assert not any(aside[:20])
+    assert any(aside[21:30])
+    assert not all(aside[21:])
+
+
 # -- rewards, costs and ends ---------------------------------------------------------------------------------------
 
 
