@@ -83,7 +83,7 @@ class KeepRight(GoToGoal):
 
     Of the others ahead, by their estimates, the nearest turns an agent to the right, the more the nearer it is within
     `RANGE`. An agent that has moved by less than `STUCK` in 1 s, and isn't at its goal, goes in a random direction for
-    0.5 to 1.5 s. In the plane.
+    0.5 to 1.5 s, and then tries again for at least 1 s. In the plane.
     """
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
@@ -105,7 +105,7 @@ class KeepRight(GoToGoal):
         self._period = env.control_period
         self._past: dict[str, list[FloatArray]] = {agent: [] for agent in env.layouts}
         self._detour = {agent: np.zeros((len(seeds), 2)) for agent in env.layouts}
-        self._left = {agent: np.zeros(len(seeds)) for agent in env.layouts}  # s, of the detour
+        self._left = {agent: np.full(len(seeds), -1.0) for agent in env.layouts}  # s, of a detour; since it ended
 
     def way(self, agent: str, position: FloatArray, seen: FloatArray) -> FloatArray:
         """See the class."""
@@ -123,7 +123,7 @@ class KeepRight(GoToGoal):
         past.append(position.copy())
         if len(past) > self._second:
             moved = np.hypot(*(position - past.pop(0)).T)
-            for env in np.flatnonzero((moved < STUCK) & (distance > STUCK) & (left <= 0.0)).tolist():
+            for env in np.flatnonzero((moved < STUCK) & (distance > STUCK) & (left <= -1.0)).tolist():
                 angle = self._generators[env].uniform(0.0, 2.0 * math.pi)
                 detour[env] = math.cos(angle), math.sin(angle)
                 left[env] = self._generators[env].uniform(0.5, 1.5)
