@@ -196,10 +196,10 @@ def compare(
             except ValueError as error:
                 raise ValueError(f"policy {spec!r}: {error}") from error
     observers = player.environment(observe[0], *rows[0][2:]).simulator.observers
-    over: tuple[str, ...] = ()
+    over: tuple[str, str] | tuple[()] = ()
     if isinstance(observers, Networked):
-        several = len(networks or ()) > 1
-        over = ", ".join(networks or ()) if several else observers.network.described(), observers.estimator.name
+        several = ", ".join(networks) if networks is not None and len(networks) > 1 else ""
+        over = (several or observers.network.described(), observers.estimator.name)
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
     tasks: list[_Task] = [
         (spec, env.observe, bounds, network, chunk) for spec, env, bounds, network in rows for chunk in chunks

@@ -125,7 +125,7 @@ def test_the_command_prints_rates_and_networks():
     measured = {"collision_rate", "success_rate", "arrival_time", "min_distance", "deadlock_rate", "intervention"}
     assert measured < set(rows[0])
     table = khop("--policies", "zero", "--env", "max_cycles=20").stdout
-    assert "navigation_v0 on crossing, 2 episodes" in table
+    assert "navigation_v0 on crossing over a network (a message every 50 ms" in table
     assert "collided" in table
     assert "deadlock" in table
     refused = khop("--network", "ideal", "--env", "network=wifi")
