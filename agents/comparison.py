@@ -15,6 +15,7 @@ import numpy as np
 
 from agents.evaluation import Episodes, chosen_scenario, play
 from agents.learning.learned import LearnedPolicy
+from agents.outcomes import summary
 from agents.policies import make_policy
 from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 CHUNK = 25  # episodes per batch; fixed, so that results don't depend on the number of workers
 
-_Task = tuple[str, Observe, bool, tuple[int, ...]]  # policy, observation mode, with bounds, seeds
+_Task = tuple[str, Observe, bool, str | None, tuple[int, ...]]  # policy, observation mode, with bounds, network, seeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +44,13 @@ class Row:
         policy: the policy's name as requested.
         env: description of the environment it acted in.
         episodes: measurements of its episodes.
+        network: in which it acted, as requested; None for that of the arguments or the scenario.
     """
 
     policy: str
     env: EnvDescription
     episodes: Episodes
+    network: str | None = None
 
     __repr__ = brief
 
@@ -58,8 +61,8 @@ class Row:
 
     @property
     def label(self) -> str:
-        """Policy and observation mode, e.g. "tanh on estimate"."""
-        return f"{self.policy} on {self.observe}"
+        """Policy, observation mode, and network if several are compared, e.g. "tanh on estimate over wifi"."""
+        return f"{self.policy} on {self.observe}" + ("" if self.network is None else f" over {self.network}")
 
     def summary(self) -> dict[str, Any]:
         """Means, medians and extremes over the episodes; a settling time that isn't finite is None."""
@@ -74,6 +77,8 @@ class Row:
             "effort": float(episodes.effort.mean()),
             "max_normalized_disagreement": float(episodes.max_normalized_disagreement.max()),
             "max_error_to_bound": float(episodes.max_error_to_bound.max()),
+            **summary(episodes.outcomes),
+            **({"network": self.network} if self.network is not None or episodes.outcomes else {}),
         }
 
 
@@ -102,11 +107,11 @@ class Comparison:
     def summary(self) -> dict[str, Any]:
         """The output of `khop evaluate --json`; a row with fewer episodes than planned has the key `episodes`."""
         summaries = [row.summary() for row in self.rows]
-        for row, summary in zip(self.rows, summaries, strict=True):
+        for row, found in zip(self.rows, summaries, strict=True):
             if len(row.episodes.seed) < self.planned:
-                summary["episodes"] = len(row.episodes.seed)
-            if self.network is not None and not summary["max_normalized_disagreement"]:
-                summary["max_normalized_disagreement"] = None  # an estimator without funnels
+                found["episodes"] = len(row.episodes.seed)
+            if self.network is not None and not found["max_normalized_disagreement"]:
+                found["max_normalized_disagreement"] = None  # an estimator without funnels
         where: dict[str, Any] = {"environment": self.environment, "scenario": self.scenario, "episodes": self.planned}
         where |= {"network": self.network, "estimator": self.estimator}
         unit = self.rows[0].env.error_unit if self.rows else None
@@ -120,10 +125,14 @@ class Comparison:
         return float(differences.mean()), interval95(differences)
 
     def frame(self) -> pl.DataFrame:
-        """A tidy data frame with one row per policy, observation mode and episode."""
+        """A tidy data frame with one row per policy, observation mode, network and episode."""
         import polars as pl
 
-        return pl.concat(row.episodes.frame(row.policy, row.env) for row in self.rows)
+        frames = [row.episodes.frame(row.policy, row.env) for row in self.rows]
+        if any(row.network is not None for row in self.rows):
+            networks = [pl.lit(row.network).alias("network") for row in self.rows]
+            frames = [frame.with_columns(network) for frame, network in zip(frames, networks, strict=True)]
+        return pl.concat(frames)
 
 
 def compare(
@@ -136,6 +145,7 @@ def compare(
     workers: int = 1,
     ray: bool = False,
     arguments: Mapping[str, Any] | None = None,
+    networks: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
     """Run every policy under every observation mode over the same episodes.
@@ -150,6 +160,8 @@ def compare(
         ray: run on a Ray cluster instead (an existing one, or a local one).
         arguments: further arguments of the environment, e.g. {"max_cycles": 100}. A learned policy that was trained
             with bounds in its observations always gets them.
+        networks: names of networks, e.g. ["ideal", "lossy:loss=0.3"], in each of which everything is played; None for
+            the one of `arguments` or the scenario.
         progress: called with the completed fraction.
 
     Raises:
@@ -168,30 +180,38 @@ def compare(
             f"expected at least one policy and one observation mode, no mode twice; got policies={list(policies)} and "
             f"observe={list(observe)}"
         )
+    if networks is not None and (not networks or "network" in (arguments or {})):
+        raise ValueError(f"networks must be names, and arguments without a network then; got networks={networks!r}")
     player = _Player(environment, chosen_scenario(environment, scenario), arguments or {})
-    rows: list[tuple[str, EnvDescription, bool]] = []
-    for spec in policies:  # check that each policy fits before the first episode
+    rows: list[tuple[str, EnvDescription, bool, str | None]] = []
+    # check that each policy fits before the first episode
+    for spec, network in itertools.product(policies, networks or (None,)):
         policy = make_policy(spec)
         bounds = isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
         for mode in observe:
-            env = describe(player.environment(mode, bounds))
-            rows.append((spec, env, bounds))
+            env = describe(player.environment(mode, bounds, network))
+            rows.append((spec, env, bounds, network))
             try:
                 policy.reset(env, [0])
             except ValueError as error:
                 raise ValueError(f"policy {spec!r}: {error}") from error
-    observers = player.environment(observe[0], rows[0][2]).simulator.observers
-    over = (observers.network.described(), observers.estimator.name) if isinstance(observers, Networked) else ()
+    observers = player.environment(observe[0], *rows[0][2:]).simulator.observers
+    over: tuple[str, str] | tuple[()] = ()
+    if isinstance(observers, Networked):
+        several = ", ".join(networks) if networks is not None and len(networks) > 1 else ""
+        over = (several or observers.network.described(), observers.estimator.name)
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
-    tasks: list[_Task] = [(spec, env.observe, bounds, chunk) for spec, env, bounds in rows for chunk in chunks]
+    tasks: list[_Task] = [
+        (spec, env.observe, bounds, network, chunk) for spec, env, bounds, network in rows for chunk in chunks
+    ]
     results: list[Episodes | None] = [None] * len(tasks)
 
     def comparison() -> Comparison:
         result = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds), *over)
-        for number, (spec, env, _) in enumerate(rows):
+        for number, (spec, env, _, network) in enumerate(rows):
             parts = list(itertools.takewhile(bool, results[number * len(chunks) : (number + 1) * len(chunks)]))
             if parts:
-                result.rows.append(Row(spec, env, Episodes.joined(parts)))  # type: ignore[arg-type]
+                result.rows.append(Row(spec, env, Episodes.joined(parts), network))  # type: ignore[arg-type]
         return result
 
     try:
@@ -231,19 +251,20 @@ class _Player:
 
     def __init__(self, environment: Environment, scenario: Scenario, arguments: Mapping[str, Any]) -> None:
         self._environment, self._scenario, self._arguments = environment, scenario, dict(arguments)
-        self._made: dict[tuple[Observe, bool], BatchedEnv] = {}
+        self._made: dict[tuple[Observe, bool, str | None], BatchedEnv] = {}
 
-    def environment(self, observe: Observe, bounds: bool) -> BatchedEnv:
+    def environment(self, observe: Observe, bounds: bool, network: str | None) -> BatchedEnv:
         """The environment, with num_envs = CHUNK; with bounds in observations unless the arguments say otherwise."""
-        if (observe, bounds) not in self._made:
+        if (observe, bounds, network) not in self._made:
             arguments = {"bounds": True, **self._arguments} if bounds else self._arguments
+            arguments = arguments if network is None else {**arguments, "network": network}
             env = make_batched(self._environment, self._scenario, num_envs=CHUNK, observe=observe, **arguments)
-            self._made[observe, bounds] = env
-        return self._made[observe, bounds]
+            self._made[observe, bounds, network] = env
+        return self._made[observe, bounds, network]
 
     def __call__(self, task: _Task) -> Episodes:
-        spec, observe, bounds, seeds = task
-        return play(self.environment(observe, bounds), make_policy(spec), seeds, name=spec)
+        spec, observe, bounds, network, seeds = task
+        return play(self.environment(observe, bounds, network), make_policy(spec), seeds, name=spec)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_made": {}}

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from agents.outcomes import Outcomes
 from agents.policies import make_policy
 from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds
 from khop_env.brief import brief
@@ -42,6 +43,11 @@ class Episodes:
         max_error_to_bound: (E,) largest |estimation error| / bound.
         task_error: (T + 1, E) mean over the agents, at every control period; constant after an early end.
         time: (T + 1,) in s.
+        outcomes: (E,) each, where agents may collide: "collision" and "success" (all at their goals, and no collision),
+            0 or 1; "arrival_time", mean over the agents in s, nan if not all are at their goals at the end;
+            "min_distance" of two agents in m; "deadlock", 1 if not all are at their goals at the end and nobody has
+            moved by 0.1 m in the last 2 s; "intervention", mean over agents and time of a filter's changes of
+            their inputs in m/s, nan without a filter. Nothing in other environments.
     """
 
     seed: np.ndarray
@@ -54,6 +60,7 @@ class Episodes:
     max_error_to_bound: FloatArray
     task_error: FloatArray
     time: FloatArray
+    outcomes: Mapping[str, FloatArray] = field(default_factory=dict)
 
     __repr__ = brief
 
@@ -61,11 +68,12 @@ class Episodes:
     def joined(parts: Sequence[Episodes]) -> Episodes:
         """Concatenate along the episode axis."""
         values = {
-            field.name: np.concatenate([getattr(part, field.name) for part in parts], axis=-1)
-            for field in fields(Episodes)
-            if field.name != "time"
+            each.name: np.concatenate([getattr(part, each.name) for part in parts], axis=-1)
+            for each in fields(Episodes)
+            if each.name not in ("time", "outcomes")
         }
-        return Episodes(**values, time=parts[0].time)
+        outcomes = {name: np.concatenate([part.outcomes[name] for part in parts]) for name in parts[0].outcomes}
+        return Episodes(**values, time=parts[0].time, outcomes=outcomes)
 
     def frame(self, policy: str, env: EnvDescription) -> pl.DataFrame:
         """A tidy data frame with one row per episode: environment, scenario, mode, policy and measurements.
@@ -77,10 +85,10 @@ class Episodes:
         import polars as pl
 
         where = {"environment": env.environment, "scenario": env.scenario, "observe": env.observe, "policy": policy}
-        excluded = ("task_error", "time", "returns", "seed")
-        rest = [field.name for field in fields(self) if field.name not in excluded]
+        excluded = ("task_error", "time", "returns", "seed", "outcomes")
+        rest = [each.name for each in fields(self) if each.name not in excluded]
         numbers = {"seed": self.seed, "return": self.returns, **{name: getattr(self, name) for name in rest}}
-        return pl.DataFrame({**where, **numbers})
+        return pl.DataFrame({**where, **numbers, **self.outcomes})
 
 
 def chosen_scenario(environment: Environment, scenario: Scenario | str | Path | None) -> Scenario:
@@ -170,13 +178,14 @@ def play(
 
 def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Episodes:
     """Run one batch of episodes and keep the first `count`."""
-    horizon, period = env.settings.max_cycles, env.settings.control_period
+    horizon, period = env.settings.horizon, env.settings.control_period
     error, returns, effort = np.zeros((horizon + 1, env.num_envs)), np.zeros(env.num_envs), np.zeros(env.num_envs)
     worst, late, bound = (np.zeros(env.num_envs) for _ in range(3))
     inputs = np.array([env.fleet.models[env.fleet.agent(agent)].m for agent in env.agents])
     policy.reset(describe(env), policy_seeds(seeds))
     observations, infos = env.reset(seeds)
     error[0] = infos["task_error"].mean(axis=1)
+    outcomes = Outcomes(env, infos)
     running, length = np.ones(env.num_envs, bool), np.full(env.num_envs, horizon)
     for cycle in range(1, horizon + 1):
         actions = _by_agent(env, policy.act(by_agent(env, observations)))
@@ -194,6 +203,7 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
         bound = np.maximum(bound, np.where(running, infos["max_error_to_bound"].max(axis=1), 0.0))
         error[cycle] = np.where(running, infos["task_error"].mean(axis=1), error[cycle - 1])
         over = terminated | truncated
+        outcomes.add(cycle, running, over, infos, getattr(policy, "intervention", None) or None)
         length[running & over] = cycle
         running &= ~over
         if not running.any():
@@ -216,7 +226,9 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
         "task_error": error,
     }
     return Episodes(
-        **{key: values[..., :count] for key, values in whole.items()}, time=period * np.arange(horizon + 1.0)
+        **{key: values[..., :count] for key, values in whole.items()},
+        time=period * np.arange(horizon + 1.0),
+        outcomes={key: values[:count] for key, values in outcomes.result().items()},
     )
 
 

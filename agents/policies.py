@@ -7,16 +7,19 @@ from typing import get_type_hints
 from agents.laws import LAWS
 from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
+from agents.navigation import GoToGoal, KeepRight
 from agents.policy import Policy
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
 from khop_env.registry import environments, parameters_from_text
 
-FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy]] = {
+FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy] | type[GoToGoal]] = {
     "zero": ZeroPolicy,
     "random": RandomPolicy,
     "bang_bang": BangBangPolicy,
+    "go_to_goal": GoToGoal,
+    "keep_right": KeepRight,
 }
 POLICIES = (*LAWS, *FLOOR)
 """Names of the scripted policies."""

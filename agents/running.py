@@ -19,6 +19,8 @@ from khop_env.results.recording import StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
 
+ARROW_TIME = 0.5  # s: frames show a filter's correction of a velocity as the way of this time
+
 
 class PolicyRun:
     """Stands in for a simulator in `results.record`: its steps are control periods of an environment with a policy.
@@ -53,7 +55,7 @@ class PolicyRun:
     def duration(self) -> float:
         """Length of the episode in s."""
         settings = self.env.batched.settings
-        return settings.max_cycles * settings.control_period
+        return settings.horizon * settings.control_period
 
     @property
     def extremes(self) -> Extremes:
@@ -75,6 +77,8 @@ class PolicyRun:
             StoppedError: if the policy fails, or its actions are refused.
         """
         actions: Mapping[str, Any] = self._guarded(self.policy.act, self._observations)
+        if correction := getattr(self.policy, "correction", None):  # a filter's, by agent in m/s, for frames
+            self.env.batched.world.arrows = ARROW_TIME * np.stack(list(correction.values()))[..., None]
         self._observations, rewards, *_ = self._guarded(self.env.step, actions)
         self.episode_return += float(np.mean(list(rewards.values())))
         for running, now in zip(self._extremes, self.simulator.extremes, strict=True):
@@ -141,13 +145,15 @@ def environment_for(spec: str, scenario: Scenario) -> str:
         scenario: where it acts.
 
     Returns:
-        What a learned policy was trained for; for others the environment of the scenario's law, or consensus.
+        What a learned policy was trained for; for others the environment that it is the default policy of, that of the
+        scenario's law, or consensus.
 
     Raises:
         ValueError: if a learned policy was trained for a task that isn't of the library.
     """
     of_law = f"{scenario.law.name}_v0"
-    other = of_law if of_law in environments() else "consensus_v0"
+    of_policy = [name for name in environments() if find_task(name).default_policy == spec.partition(":")[0]]
+    other = of_policy[0] if of_policy else of_law if of_law in environments() else "consensus_v0"
     found: str = _training(make_policy(spec), None, scenario).get("environment", other)
     if found not in environments():
         raise ValueError(

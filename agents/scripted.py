@@ -87,7 +87,16 @@ class LawPolicy:
         make_law(LawChoice(name, self.parameters))  # raises on unknown names or parameters
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Choose the parameters, and look up the columns of the observations by name."""
+        """Choose the parameters, and look up the columns of the observations by name.
+
+        Raises:
+            ValueError: if no agent has a task edge, along which a law acts.
+        """
+        if not any(slot.task_edge for layout in env.layouts.values() for slot in layout.slots):
+            raise ValueError(
+                f"{self.name} acts along task edges, and agents of {env.environment} have none; take another policy, "
+                "e.g. zero, or one of your own"
+            )
         tuned = tuned_parameters(env, self.name)
         self.law = make_law(LawChoice(self.name, {**tuned, **self.parameters}))
         if isinstance(self.law, VelocityLaw) and hasattr(self.law, "gain") and "gain" not in self.parameters:
@@ -95,7 +104,7 @@ class LawPolicy:
         self._env, self._time = env, 0.0
         self._view: View | None = None
         self._fleet = Fleet(list(env.models.values()))
-        self._reader = _Reader(env, self._fleet)
+        self._reader = Reader(env, self._fleet)
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """The law's inputs as fractions of their limits."""
@@ -117,7 +126,7 @@ class LawPolicy:
         return actions
 
 
-class _Reader:
+class Reader:
     """Builds a `View` from the concatenated observations of all agents."""
 
     def __init__(self, env: EnvDescription, fleet: Fleet) -> None:

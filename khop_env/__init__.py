@@ -15,10 +15,11 @@ import pettingzoo
 from khop_env.catalog import ENVIRONMENTS, gymnasium_id
 
 if TYPE_CHECKING:
-    from khop_env import consensus_v0, formation_v0, leader_following_v0
+    from khop_env import consensus_v0, formation_v0, leader_following_v0, navigation_v0
     from khop_env.env import (
         Actuator,
         BatchedEnv,
+        CostsApart,
         Direct,
         Hold,
         JointEnv,
@@ -66,8 +67,18 @@ if TYPE_CHECKING:
     )
     from khop_env.results import Recording, paper_figure, record, summarize
     from khop_env.scenarios import LawChoice, Scenario
-    from khop_env.simulation import InitialSet, Law, Simulator, View
-    from khop_env.tasks import Column, Consensus, EdgeTask, Formation, LeaderFollowing, Outcome, Task, World
+    from khop_env.simulation import Arena, InitialSet, Law, Obstacle, Simulator, View
+    from khop_env.tasks import (
+        Column,
+        Consensus,
+        EdgeTask,
+        Formation,
+        LeaderFollowing,
+        Navigation,
+        Outcome,
+        Task,
+        World,
+    )
     from khop_env.testing import check_environment
 
 __version__ = "0.1.0"
@@ -77,10 +88,12 @@ __all__ = [
     "VELOCITY_CONTROLLERS",
     "Actuator",
     "AgentModel",
+    "Arena",
     "BandLimitedNoise",
     "BatchedEnv",
     "Column",
     "Consensus",
+    "CostsApart",
     "Coupling",
     "DesignError",
     "Direct",
@@ -103,8 +116,10 @@ __all__ = [
     "Law",
     "LawChoice",
     "LeaderFollowing",
+    "Navigation",
     "ObservationLayout",
     "ObserverDesign",
+    "Obstacle",
     "Outcome",
     "PerformanceFunction",
     "Proximal",
@@ -133,6 +148,7 @@ __all__ = [
     "make_joint",
     "make_sb3_vec",
     "make_vec",
+    "navigation_v0",
     "paper_figure",
     "record",
     "scenario",

@@ -9,6 +9,7 @@ ENVIRONMENTS = {
     "consensus_v0": "khop_env.tasks.consensus:Consensus",
     "formation_v0": "khop_env.tasks.formation:Formation",
     "leader_following_v0": "khop_env.tasks.leader_following:LeaderFollowing",
+    "navigation_v0": "khop_env.tasks.navigation:Navigation",
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -112,13 +113,17 @@ def make_batched(
         if name not in (*of_settings, *of_task):
             known = ["scenario", *of_task, *of_settings, "num_envs", "render_mode"]
             raise TypeError(f"got an unexpected keyword argument {name!r}; {did_you_mean(name, known)}")
-    settings = Settings(**{name: value for name, value in arguments.items() if name in of_settings})
+    chosen_settings = {**task.defaults, **{name: value for name, value in arguments.items() if name in of_settings}}
+    settings = Settings(**chosen_settings)
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ValueError(f"num_envs must be a positive integer; got {num_envs!r}")
     chosen = _chosen_scenario(task.default_scenario if scenario is None else scenario)
     if isinstance(task, type):
         task = task(**{name: value for name, value in arguments.items() if name in of_task})
     settings, observers = _observers_of(settings, chosen)
+    if settings.max_cycles is None:
+        cycles = max(1, math.ceil(chosen.duration / settings.control_period - 1e-9))
+        settings = dataclasses.replace(settings, max_cycles=cycles)
     return BatchedEnv(chosen.build(observers=observers, num_envs=int(num_envs)), task, settings, chosen.name)
 
 
@@ -243,7 +248,7 @@ def spelled_out(task: type[Task]) -> Callable[[Function], Function]:
         hints = get_type_hints(Settings) | get_type_hints(task)
         keywords = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hints[name])
-            for name, default in {**_task_parameters(task), **_defaults(Settings)}.items()
+            for name, default in {**_task_parameters(task), **_defaults(Settings), **task.defaults}.items()
         ]
         shown = signature.replace(parameters=[*fixed, *keywords], return_annotation=own["return"])
         function.__signature__ = shown  # type: ignore[attr-defined]

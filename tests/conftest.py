@@ -45,6 +45,7 @@ SLOW = tuple(
         "benchmarks/test_benchmark.py::test_ctrl_c",
         "env/test_integrations.py::TestNames::test_import",
         "env/test_windows.py::test_without_a_display",
+        "tasks/test_navigation.py::test_the_contract_is_kept",
         "observers/test_node.py::test_it_runs_without_numba",
         "results/test_figures.py::test_pyplot_is_left_alone",
         "test_cli.py::TestRun",

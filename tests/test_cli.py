@@ -13,7 +13,9 @@ from typer.testing import CliRunner
 
 import khop_env
 from khop_env import __version__
+from khop_env.catalog import ENVIRONMENTS
 from khop_env.cli import COMMANDS, app
+from khop_env.registry import SCENARIOS
 
 
 def khop(*arguments: str, status: int = 0):
@@ -56,8 +58,8 @@ class TestList:
 
     def test_json(self):
         found = only_json(khop("list", "--json"))
-        assert [one["name"] for one in found["scenarios"]] == ["paper", "convoy", "mixed_fleet", "random_geometric"]
-        assert found["environments"] == ["consensus_v0", "formation_v0", "leader_following_v0"]
+        assert [one["name"] for one in found["scenarios"]] == list(SCENARIOS)
+        assert found["environments"] == list(ENVIRONMENTS)
 
 
 LONG = "linear:gain=2,cancel_drift=true"

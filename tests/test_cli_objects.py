@@ -150,7 +150,7 @@ class TestArguments:
             ("control_period", "--env takes NAME=VALUE; got 'control_period'"),
             ("reward=tem", "--env reward: expected 'agent' or 'team'; got 'tem'; did you mean 'team'?"),
             ("uniform=yes", "--env uniform: expected true or false; got 'yes'"),
-            ("max_cycles=2.5", "--env max_cycles: expected an integer; got '2.5'"),
+            ("max_cycles=2.5", "--env max_cycles: expected an integer or none; got '2.5'"),
             ("observe=local", "--env observe: this command sets it by --observe"),
             ("dt=-1", "dt must be a positive, finite number of at most 1e30; got -1.0"),
             ("spacing=2", "--env spacing=2: no argument 'spacing'; known: "),

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from khop_env.catalog import ENVIRONMENTS
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("khop_env", "agents", "benchmarks")
 ON_DEMAND = ("khop_env.commands.bench", "benchmarks.benchmark")  # the one that runs what only a clone has
@@ -29,7 +31,7 @@ RANKS = [
     ["khop_env.tasks"],
     ["khop_env.env"],
     ["khop_env.scenarios"],
-    ["khop_env.registry", "khop_env.consensus_v0", "khop_env.formation_v0", "khop_env.leader_following_v0"],
+    ["khop_env.registry", *(f"khop_env.{name}" for name in ENVIRONMENTS)],
     ["khop_env.typed"],
     ["khop_env.testing"],
     ["khop_env.results"],

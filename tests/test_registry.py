@@ -20,7 +20,7 @@ def test_the_registry_equals_the_files():
         if callable(getattr(content, module.name, None)):
             found.add(module.name)
     assert set(SCENARIOS) == found
-    assert set(SCENARIOS) == {"paper", "convoy", "mixed_fleet", "random_geometric"}
+    assert set(SCENARIOS) == {"paper", "convoy", "mixed_fleet", "random_geometric", "swap", "crossing", "corridor"}
     assert scenarios() == tuple(SCENARIOS)
 
 
@@ -40,7 +40,8 @@ def test_every_scenario_is_complete(name):
 def test_descriptions():
     assert [one["name"] for one in describe()] == list(scenarios())
     assert all(one["description"] for one in describe())
-    assert describe()[-1]["parameters"] == {"agents": 100, "k": 2, "seed": 0, "rate": 5.0}
+    by_name = {one["name"]: one["parameters"] for one in describe()}
+    assert by_name["random_geometric"] == {"agents": 100, "k": 2, "seed": 0, "rate": 5.0}
 
 
 def test_parameters_of_a_family():
@@ -64,7 +65,7 @@ def test_a_file(tmp_path):
     ("name", "parameters", "said"),
     [
         ("papr", {}, "no scenario 'papr'; did you mean 'paper'?"),
-        ("zzz", {}, "known: paper, convoy, mixed_fleet, random_geometric"),
+        ("zzz", {}, "known: paper, convoy, mixed_fleet, random_geometric, swap, crossing, corridor"),
         ("random_geometric:agnts=3", {}, "no parameter 'agnts'; did you mean 'agents'?"),
         ("random_geometric", {"agnts": 3}, "no parameter 'agnts'; did you mean 'agents'?"),
         ("random_geometric:agents=many", {}, "agents must be of type int; got 'many'"),

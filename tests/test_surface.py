@@ -19,12 +19,20 @@ import pytest
 
 import khop_env
 from agents import compare, describe
-from khop_env import consensus_v0, formation_v0, leader_following_v0
+from khop_env import consensus_v0, formation_v0, leader_following_v0, navigation_v0
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.env import Settings, SettingsArguments
 from khop_env.physics import Sinusoid
 from khop_env.results import record
-from khop_env.tasks import Consensus, EdgeArguments, EdgeTask, Formation, LeaderFollowing
+from khop_env.tasks import (
+    Consensus,
+    EdgeArguments,
+    EdgeTask,
+    Formation,
+    LeaderFollowing,
+    Navigation,
+    NavigationArguments,
+)
 
 ROOT = Path(__file__).parents[1]
 USER_FILE = '''
@@ -172,6 +180,8 @@ def fields(cls):
         (consensus_v0.Arguments, (Settings, Consensus)),
         (formation_v0.Arguments, (Settings, Formation)),
         (leader_following_v0.Arguments, (Settings, LeaderFollowing)),
+        (NavigationArguments, Navigation),
+        (navigation_v0.Arguments, (Settings, Navigation)),
     ],
 )
 def test_typed_dictionaries_equal_the_dataclasses(arguments, cls):
@@ -179,7 +189,7 @@ def test_typed_dictionaries_equal_the_dataclasses(arguments, cls):
     assert typed(arguments) == {name: hint for one in several for name, hint in fields(one).items()}
 
 
-@pytest.mark.parametrize("module", [consensus_v0, formation_v0, leader_following_v0])
+@pytest.mark.parametrize("module", [consensus_v0, formation_v0, leader_following_v0, navigation_v0])
 @pytest.mark.parametrize("name", ["parallel_env", "env", "batched_env"])
 def test_signatures_show_every_argument_with_its_type_in_few_words(module, name):
     function = getattr(module, name)
@@ -218,7 +228,7 @@ def printed():
         (design, "ObserverDesign(200 integrator; k=2, ", f"{design.states.layout.pairs} state and "),
         (design.states, "Funnels(layout=PairLayout("),
         (design.links, "Links(agents=200, sender=int64["),
-        (scenario.initial, "InitialSet(center=float64[400], radius=float64[400])"),
+        (scenario.initial, "InitialSet(center=float64[400], radius=float64[400]"),
         (simulator, "Simulator(3 integrator, 3 cart, 3 unicycle, 3 vessel; k=3", "num_envs=300, t = 0 to 0.25 s)"),
         (simulator, "Proximal(order=2, threads=1), no law"),
         (simulator.save(), "SimulatorState(t=float64[300], x=float64["),

@@ -53,7 +53,7 @@ class TrainingVecEnv(VecEnvWrapper):
     def reset(self) -> Float32Array:
         """Start new, staggered episodes; features (num_envs * N, size)."""
         self.before = np.asarray(self.venv.reset())
-        state, horizon = self.batched.get_state(), self.batched.settings.max_cycles
+        state, horizon = self.batched.get_state(), self.batched.settings.horizon
         staggered = np.arange(self.batched.num_envs) * horizon // self.batched.num_envs
         self.batched.set_state(dataclasses.replace(state, cycles=staggered))
         return self.scaler(self.before, None)

@@ -156,7 +156,7 @@ def played_episode(
     if duration is not None or task is None:
         number_of_steps(scenario.duration if duration is None else duration, scenario.dt)
     elsewhere = {"observe": "--observe"} | ({} if duration is None else {"max_cycles": "--duration"})
-    spec = controller or scenario.law.name
+    spec = controller or (None if task is None else task.default_policy) or scenario.law.name
     acted = task if task is not None else find_task(environment_for(spec, scenario))
     arguments = with_network(environment_arguments(env, acted, elsewhere), network, estimator)
     if task is None and duration is None and "max_cycles" not in arguments:

@@ -14,7 +14,6 @@ from khop_env.commands.common import (
     EnvOption,
     EstimatorOption,
     JsonOption,
-    NetworkOption,
     load,
     mistakes,
     print_json,
@@ -24,24 +23,32 @@ from khop_env.commands.common import (
 from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
 
 if TYPE_CHECKING:
-    from agents.comparison import Comparison
+    from agents.comparison import Comparison, Row
 
 
 def evaluate(
     environment: EnvironmentArgument,
     scenario: EnvironmentScenario = None,
     policies: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
-            "classes of your own, my_file.py:MyPolicy."
+            "go_to_goal and keep_right in navigation_v0; classes of your own, my_file.py:MyPolicy. By default tanh, "
+            "linear, zero and random, or go_to_goal, zero and random."
         ),
-    ] = "tanh,linear,zero,random",
+    ] = None,
     observe: Annotated[
         str, typer.Option(help="Observation modes: estimate, oracle (true states), local (neighbours only).")
     ] = "estimate,oracle,local",
-    network: NetworkOption = None,
+    network: Annotated[
+        str | None,
+        typer.Option(
+            "--network",
+            help="Networks, in each of which all is played: ideal,wifi,lossy:loss=0.3,burst=5 (khop network); by "
+            "default the scenario's own, if any.",
+        ),
+    ] = None,
     estimator: EstimatorOption = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each row, the same for all.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
@@ -67,17 +74,22 @@ def evaluate(
         if csv and as_json:
             raise ValueError("--csv and --json: choose one of them")
         require_figure(figure)
-        arguments = environment_arguments(env, find_task(environment), {"observe": "--observe"})
-        arguments = with_network(arguments, network, estimator)
+        task = find_task(environment)
+        default = f"{task.default_policy or 'tanh,linear'},zero,random"
+        arguments = environment_arguments(env, task, {"observe": "--observe"})
+        networks = [] if network is None else split_specs(network, "--network", "network")
+        single = with_network(arguments, network, estimator)  # refuses two choices
+        arguments = single if len(networks) < 2 else with_network(arguments, None, estimator)
         chosen = None if scenario is None else load(scenario)
         with Progress(f"playing {environment}") as progress:
             try:
                 comparison = compare(
                     environment,
-                    split_specs(policies, "--policies", "policy"),
+                    split_specs(policies or default, "--policies", "policy"),
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
                     scenario=chosen,
                     arguments=arguments,
+                    networks=networks if len(networks) > 1 else None,
                     seeds=range(seed, seed + episodes),
                     workers=workers,
                     ray=ray,
@@ -110,7 +122,11 @@ def _draw(comparison: Comparison, figure: Path) -> None:
     from khop_env.results.curves import error_over_time
 
     first = comparison.rows[0].episodes
-    errors = {(row.policy, str(row.observe)): row.episodes.task_error for row in comparison.rows}
+    several = len({row.network for row in comparison.rows}) > 1
+    errors = {
+        (f"{row.policy} over {row.network}" if several else row.policy, str(row.observe)): row.episodes.task_error
+        for row in comparison.rows
+    }
     title = (
         f"{comparison.environment} on {comparison.scenario}: median and middle half of {comparison.planned} episodes"
     )
@@ -124,16 +140,21 @@ def print_comparison(comparison: Comparison) -> None:
     networked = comparison.network is not None
     # over a network only some estimators have disagreements, which no guarantee is about
     no_disagreement = networked and not any(row.episodes.max_normalized_disagreement.any() for row in comparison.rows)
+    where = f"{comparison.environment} on {comparison.scenario}"
+    if networked:
+        where += f" over a network ({comparison.network}), estimator {comparison.estimator}"
+    title = f"{where}, {comparison.planned} episodes, the same for every row"
+    if comparison.rows[0].episodes.outcomes:
+        _print_outcomes(comparison, title)
+        return
     rows = []
     for number, row in enumerate(comparison.rows):
         seen = row.summary()
         more, interval = comparison.difference(row)
         settling = seen["settling_time"]
-        count = len(row.episodes.seed)
-        few = "" if count == comparison.planned else f" ({count} episodes)"
         rows.append(
             (
-                f"{folded(row.policy)} on {row.observe}{few}",
+                _name(row, comparison),
                 _with_interval(seen["mean_return"], seen["ci95"]),
                 _with_interval(more, interval, sign="+") if number else "",
                 f"{seen['final_task_error']:.3g}",
@@ -146,14 +167,10 @@ def print_comparison(comparison: Comparison) -> None:
     unit = comparison.rows[0].env.error_unit
     ratios = ("e / bound",) if no_disagreement else ("|e|", "e / bound")
     header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", *ratios)
-    where = f"{comparison.environment} on {comparison.scenario}"
-    if networked:
-        where += f" over a network ({comparison.network}), estimator {comparison.estimator}"
     disagreement = "|e|: largest |xi| / rho" + (" of what agents hold" if networked else "")
     guarantee = "bound (of all observers, below 1 by guarantee)"
     if networked:
         guarantee = "certified bound (at most 1 by guarantee)"
-    title = f"{where}, {comparison.planned} episodes, the same for every row"
     print_table(header, rows, title)
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
@@ -161,6 +178,47 @@ def print_comparison(comparison: Comparison) -> None:
         "below a tenth of the initial one; effort: mean |u|^2, u in fractions of the limits; "
         f"{'' if no_disagreement else f'{disagreement}; '}e / bound: largest estimation error over its {guarantee}"
     )
+
+
+def _print_outcomes(comparison: Comparison, title: str) -> None:
+    """The table of an environment in which agents may collide."""
+    rows = []
+    for row in comparison.rows:
+        seen = row.summary()
+        filtered, time = seen["intervention"], seen["arrival_time"]
+        rows.append(
+            (
+                _name(row, comparison),
+                *(_rate(seen[f"{name}_rate"], seen[f"{name}_ci95"]) for name in ("collision", "success", "deadlock")),
+                "" if time is None else f"{time:.3g}",
+                f"{seen['min_distance']:.3f}",
+                "" if filtered is None else f"{filtered:.3f}",
+                _with_interval(seen["mean_return"], seen["ci95"]),
+                f"{seen['max_error_to_bound']:.3f}",
+            )
+        )
+    header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)", "return")
+    print_table((*header, "e / bound"), rows, title)
+    print_text(
+        "collided: episodes with a collision; success: all at their goals at the end, without any collision; deadlock: "
+        "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals. "
+        "time: until an agent's first arrival, mean over agents and successful episodes; distance: smallest of two "
+        "agents' centres; changed: by a filter, of each agent's inputs, mean over time; return: mean over agents of an "
+        "episode's sum, 95 % interval; e / bound: largest estimation error over its bound (below 1 by guarantee)"
+    )
+
+
+def _rate(rate: float, interval: list[float]) -> str:
+    low, high = interval
+    return f"{100.0 * rate:.3g} [{100.0 * low:.2g}, {100.0 * high:.3g}]"
+
+
+def _name(row: Row, comparison: Comparison) -> str:
+    """Policy, mode, network where there are several, and the number of episodes if some are missing."""
+    network = f" over {row.network}" if len({each.network for each in comparison.rows}) > 1 else ""
+    count = len(row.episodes.seed)
+    few = "" if count == comparison.planned else f" ({count} episodes)"
+    return f"{folded(row.policy)} on {row.observe}{network}{few}"
 
 
 def _with_interval(value: float, interval: float | None, sign: str = "") -> str:

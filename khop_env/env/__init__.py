@@ -2,6 +2,7 @@
 
 from khop_env.env.actuators import ACTUATORS, Actuator, Direct, Hold, Lag, SlewLimit
 from khop_env.env.batched import BatchedEnv
+from khop_env.env.costs import CostsApart
 from khop_env.env.joint import JointEnv
 from khop_env.env.layout import Field, ObservationLayout, Slot
 from khop_env.env.parallel import KHopEnv
@@ -14,6 +15,7 @@ __all__ = [
     "SHARED_INFOS",
     "Actuator",
     "BatchedEnv",
+    "CostsApart",
     "Direct",
     "EnvState",
     "Field",

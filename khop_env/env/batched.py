@@ -65,6 +65,7 @@ class BatchedEnv:
             t=state.t,
             x=state.x,
             inputs=inputs,
+            initial=simulator.initial,
         )
         self.task = copy.deepcopy(task)
         self.task.bind(self.world)
@@ -184,7 +185,7 @@ class BatchedEnv:
             self._advance(number)
         self._cycles += 1
         outcome = self._evaluate()
-        truncated = (self._cycles >= self.settings.max_cycles) & ~outcome.terminated
+        truncated = (self._cycles >= self.settings.horizon) & ~outcome.terminated
         self._over = outcome.terminated | truncated
         observations, infos = self._observed(outcome)
         return observations, outcome.reward, outcome.terminated, truncated, infos
@@ -284,6 +285,7 @@ class BatchedEnv:
             inputs[self._driven] = self._physical[self._driven] / self._limit[self._driven]
         self.simulator.hold(self._physical)
         self.simulator.advance(dt, self._parts)
+        self.task.moved(self.world, number)
 
     def _evaluate(self) -> Outcome:
         return self.task.evaluate(self.world)

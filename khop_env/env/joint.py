@@ -18,6 +18,9 @@ from khop_env.env.state import Infos
 _AGGREGATES: dict[str, Callable[..., Any]] = {
     "max_normalized_disagreement": np.max,
     "max_error_to_bound": np.max,
+    "cost": np.max,
+    "min_distance": np.min,
+    "obstacle_distance": np.min,
     "clipped_observations": np.sum,
     "clipped_actions": np.sum,
 }

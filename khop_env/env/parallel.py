@@ -32,8 +32,8 @@ ParallelStep = tuple[
 class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
     """Agents under partial communication, with estimates of k-hop targets: a PettingZoo ParallelEnv.
 
-    Observations, actions, rewards, infos and arguments are described in the modules `consensus_v0`, `formation_v0` and
-    `leader_following_v0`, which make such environments.
+    Observations, actions, rewards, infos and arguments are described in the modules `consensus_v0`, `formation_v0`,
+    `leader_following_v0` and `navigation_v0`, which make such environments.
 
     Args:
         batched: a `BatchedEnv` with num_envs = 1.

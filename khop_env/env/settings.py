@@ -27,7 +27,7 @@ class Settings:
             ("local"). Under a network neighbours are estimated, too, except with "oracle".
         bounds: whether slots also hold the guaranteed bound on the estimate's error.
         uniform: True for one padded Box for all agents, False for a Box without padding for each agent.
-        max_cycles: control periods after which an episode is truncated.
+        max_cycles: control periods after which an episode is truncated; None for the scenario's duration.
         control_period: time between actions in s.
         dt: the simulator's step in s; the control period by default.
         order: of the simulator's step, 1 or 2. Actions are held over a control period, so that the closed loop is of
@@ -50,7 +50,7 @@ class Settings:
     observe: Observe = "estimate"
     bounds: bool = False
     uniform: bool = True
-    max_cycles: int = 200
+    max_cycles: int | None = 200
     control_period: float = 0.05
     dt: float | None = None
     order: int = 1
@@ -71,6 +71,8 @@ class Settings:
                 raise ValueError(f"{name} must be True or False; got {getattr(self, name)!r}")
         for name in ("max_cycles", "order", "threads"):
             value = getattr(self, name)
+            if value is None and name == "max_cycles":
+                continue
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"{name} must be a positive integer; got {value!r}")
         if self.threads > MOST_THREADS:
@@ -97,6 +99,17 @@ class Settings:
                 "actuator='hold' draws a line over several simulator steps, and here a control period is one: "
                 f"give dt below control_period = {self.control_period:g} s"
             )
+
+    @property
+    def horizon(self) -> int:
+        """Control periods in an episode.
+
+        Raises:
+            ValueError: if it depends on a scenario, which isn't known here.
+        """
+        if self.max_cycles is None:
+            raise ValueError("max_cycles=None is the scenario's duration: make the environment with khop_env.make")
+        return self.max_cycles
 
     @property
     def substeps(self) -> int:
@@ -128,7 +141,7 @@ class SettingsArguments(TypedDict, total=False):
     observe: Observe
     bounds: bool
     uniform: bool
-    max_cycles: int
+    max_cycles: int | None
     control_period: float
     dt: float | None
     order: int

@@ -16,6 +16,7 @@ from khop_env.network import PROFILES, SCHEDULES
 from khop_env.observers import ESTIMATORS, Bound, Exponential
 from khop_env.observers.design import design_rule_for
 from khop_env.physics import DISTURBANCES, MODELS, AgentModel, Term
+from khop_env.scenarios.arena_table import write_arena
 from khop_env.scenarios.network_table import write_network
 from khop_env.scenarios.scenario import Scenario
 from khop_env.scenarios.schedules import schedule_table
@@ -121,6 +122,13 @@ def write_scenario(scenario: Scenario) -> str:
             "Messages: every agent sends one each period; each link loses it, or delivers it with a delay. Instead of",
             f"numbers, or beside them: profile = one of {', '.join(PROFILES)}.",
             f"Estimators: {', '.join(ESTIMATORS)}. Without this table exchange is continuous.",
+        )
+    if scenario.arena is not None:
+        _section(
+            document,
+            "arena",
+            write_arena(scenario.arena),
+            "For navigation: discs, goals, and obstacles [x, y, radius] or [x, y, x, y, half thickness].",
         )
     law = tomlkit.table()
     law.update(_plain({"name": scenario.law.name, **scenario.law.parameters}))

@@ -23,6 +23,7 @@ from khop_env.physics import (
     did_you_mean,
     validate_graph,
 )
+from khop_env.scenarios.arena_table import read_arena
 from khop_env.scenarios.checked import REQUIRED, CheckedTable, NotedError, ScenarioFileError, abbreviated, fits
 from khop_env.scenarios.export import write_scenario
 from khop_env.scenarios.network_table import read_network
@@ -99,6 +100,9 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
     if "network" in root.names():
         with root.gathering():
             values |= read_network(root.table("network"))
+    if "arena" in root.names():
+        with root.gathering():
+            values["arena"] = read_arena(root.table("arena"))
     if "models" not in values:  # nothing below can be read without models
         with root.gathering():
             root.finish()

@@ -10,16 +10,19 @@ from typing import Any, get_type_hints
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
 from khop_env.scenarios.convoy import convoy
+from khop_env.scenarios.corridor import corridor
+from khop_env.scenarios.crossing import crossing
 from khop_env.scenarios.mixed_fleet import mixed_fleet
 from khop_env.scenarios.paper import paper
 from khop_env.scenarios.random_geometric import random_geometric
 from khop_env.scenarios.scenario import Scenario
+from khop_env.scenarios.swap import swap
 
 ScenarioFactory = Callable[..., Scenario]
 """A function that makes a scenario; the parameters of a family are int, float, bool or str, with defaults."""
 
 SCENARIOS: dict[str, ScenarioFactory] = {
-    factory.__name__: factory for factory in (paper, convoy, mixed_fleet, random_geometric)
+    factory.__name__: factory for factory in (paper, convoy, mixed_fleet, random_geometric, swap, crossing, corridor)
 }
 """Every scenario of the library: the module `khop_env/scenarios/<name>.py` and its function of the same name."""
 

@@ -29,7 +29,7 @@ from khop_env.observers import (
 from khop_env.observers.design import design_rule_for
 from khop_env.physics import AgentModel, Disturbance, Fleet, Links, check_task_graph, did_you_mean, validate_graph
 from khop_env.scenarios.bounds import check_bound, widened
-from khop_env.simulation import InitialSet, Law, Observe, Simulator
+from khop_env.simulation import Arena, InitialSet, Law, Observe, Simulator
 
 MOST_AGENTS = 100_000
 SHORTEST_TIME, LONGEST_TIME = 1e-9, 1e9  # s
@@ -70,6 +70,7 @@ class Scenario:
         disturbance: w_i(x, t), or None.
         center: (n,) centre of the box that states start in, and the observers' first guess.
         radius: (n,) its half widths.
+        arena: the agents' size, obstacles, goals and smallest initial distance, for tasks in which they may collide.
         law: name and parameters of the default feedback law.
         duration: length of an experiment in s.
         dt: step in s.
@@ -97,6 +98,7 @@ class Scenario:
     disturbance: Disturbance | None = None
     center: ArrayLike = 0.0
     radius: ArrayLike = 1.0
+    arena: Arena | None = None
     law: LawChoice = LawChoice("tanh")
     duration: float = 10.0
     dt: float = 0.01
@@ -130,6 +132,10 @@ class Scenario:
             object.__setattr__(self, name, np.broadcast_to(values, (self.fleet.n,)).copy())
         if np.any(np.asarray(self.radius) < 0.0):
             raise ValueError(f"scenario {self.name!r}: radius must not be negative")
+        if self.arena is not None and self.arena.obstacles and self.fleet.position_dim != 2:
+            raise ValueError(
+                f"scenario {self.name!r}: obstacles are in the plane, and positions have {self.fleet.position_dim} axes"
+            )
 
     def _check_values(self) -> None:
         """Check the values that don't depend on fleet and graphs."""
@@ -186,7 +192,7 @@ class Scenario:
     @cached_property
     def initial(self) -> InitialSet:
         """Where states start."""
-        return InitialSet(np.asarray(self.center), np.asarray(self.radius))
+        return InitialSet(np.asarray(self.center), np.asarray(self.radius), self.arena, self.fleet.position_index)
 
     @cached_property
     def longest_step(self) -> tuple[float, int]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from khop_env.brief import brief
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, IntArray
+from khop_env.simulation.arena import Arena
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,6 +18,8 @@ class InitialSet:
     Attributes:
         center: (n,) in the states' units.
         radius: (n,) half widths, not negative.
+        arena: if it has one, positions are drawn on condition that they are far enough apart.
+        positions: (N, d) the positions' places in the state; needed with an arena.
 
     Raises:
         ValueError: if they differ in shape, or a number isn't finite or a half width negative.
@@ -24,6 +27,8 @@ class InitialSet:
 
     center: FloatArray
     radius: FloatArray
+    arena: Arena | None = None
+    positions: IntArray | None = None
 
     __repr__ = brief
 
@@ -38,4 +43,7 @@ class InitialSet:
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """One (n,) initial state."""
-        return self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
+        x = self.center + self.radius * rng.uniform(-1.0, 1.0, len(self.center))
+        if self.arena is not None and self.positions is not None:
+            x[self.positions] = self.arena.draw(self.center[self.positions], self.radius[self.positions], rng)
+        return x

@@ -5,6 +5,7 @@ from khop_env.tasks.consensus import Consensus
 from khop_env.tasks.edges import EdgeArguments, EdgeTask
 from khop_env.tasks.formation import Formation
 from khop_env.tasks.leader_following import LeaderFollowing
+from khop_env.tasks.navigation import Navigation, NavigationArguments
 
 __all__ = [
     "Column",
@@ -14,6 +15,8 @@ __all__ = [
     "Formation",
     "LeaderFollowing",
     "MapCanvas",
+    "Navigation",
+    "NavigationArguments",
     "Outcome",
     "Task",
     "World",

@@ -10,7 +10,8 @@ import abc
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import networkx as nx
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from khop_env.brief import brief
 from khop_env.observers import FloatArray, IntArray, ObserverDesign
 from khop_env.physics import Fleet
+from khop_env.simulation import InitialSet
 
 Signature = dict[str, tuple[str, ...]]
 """Properties in words, by a plural noun, which two environments must have in common to exchange states."""
@@ -37,6 +39,8 @@ class World:
         t: (B,) time since reset in s.
         x: (n, B) states.
         inputs: (m, B) inputs in force, as fractions of their limits.
+        initial: where states start, with the scenario's arena if it has one.
+        arrows: (N, d, B) in m, drawn from each agent in frames; None for none. Whoever changes actions may set it.
     """
 
     design: ObserverDesign
@@ -47,6 +51,8 @@ class World:
     t: FloatArray
     x: FloatArray
     inputs: FloatArray
+    initial: InitialSet | None = None
+    arrows: FloatArray | None = None
 
     __repr__ = brief
 
@@ -119,6 +125,8 @@ class Task(abc.ABC):
         version: of the environment.
         default_scenario: name of the scenario that is used if none is specified.
         driven_label: name in messages and legends of an agent that doesn't act.
+        default_policy: name of the policy that acts if none is named; None for the law of the scenario.
+        defaults: of arguments of the environment that aren't the task's own, where they differ from `env.Settings`.
         edges: (E, 2) directed pairs (i, j), sorted: agent i's task depends on agent j. Set by `bind`. Slots of
             observations begin with these agents, laws act along these edges, and frames draw them.
         memory: arrays that the next steps depend on, e.g. numbers drawn by `reset`; saved and restored with the state.
@@ -128,6 +136,8 @@ class Task(abc.ABC):
     version: ClassVar[int] = 0
     default_scenario: ClassVar[str] = "paper"
     driven_label: ClassVar[str] = "driven agent"
+    default_policy: ClassVar[str | None] = None
+    defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     edges: IntArray = np.zeros((0, 2), np.int64)
     memory: dict[str, FloatArray]
 
@@ -198,6 +208,14 @@ class Task(abc.ABC):
         Args:
             world: at the beginning of the step.
             u: (m, B) physical inputs, to be overwritten in the rows of these agents.
+        """
+
+    def moved(self, world: World, number: int) -> None:  # noqa: B027
+        """Follow the motion within a control period; called after every step of the simulator.
+
+        Args:
+            world: at the end of the step.
+            number: of the step within the control period, from 0.
         """
 
     @abc.abstractmethod

@@ -14,7 +14,7 @@ from agents.learning.scaling import ObservationScaler
 from agents.policy import by_agent
 from khop_env.network import Network
 from khop_env.simulation import View
-from tests.env.playing import ENVIRONMENTS, batched, parallel
+from tests.env.playing import ALONG_EDGES, batched, parallel
 
 LOSSY = "lossy:loss=0.6,burst=3"
 
@@ -42,7 +42,7 @@ def view_of(env):
 
 
 @pytest.mark.parametrize("estimator", ["ppso", "relay"])
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize("environment", ALONG_EDGES)
 @pytest.mark.parametrize("law", LAWS)
 def test_laws_act_on_what_has_arrived(environment, law, estimator):
     """On estimates of neighbours, too; as the law itself does with the numbers in the observers' memory."""

@@ -7,7 +7,7 @@ from agents import LAWS, LawPolicy, describe, make_law, make_policy, play
 from agents.policy import by_agent
 from khop_env.scenarios import LawChoice
 from khop_env.simulation import View
-from tests.env.playing import CROSS, ENVIRONMENTS, EVERY, MODES, batched, parallel
+from tests.env.playing import ALONG_EDGES, CROSS_ALONG_EDGES, EVERY_ALONG_EDGES, MODES, batched, parallel
 
 PARAMETERS = {  # all of them, so that no shipped ones are used
     "tanh": {"gain": 1.3},
@@ -43,7 +43,7 @@ def true_view(env):
     return View(acting, own, np.array(edges), np.tile(known, (len(own), 1)), columns.transpose(2, 0, 1)), acting
 
 
-@pytest.mark.parametrize(("environment", "scenario", "observe", "uniform"), CROSS)
+@pytest.mark.parametrize(("environment", "scenario", "observe", "uniform"), CROSS_ALONG_EDGES)
 @pytest.mark.parametrize("law", LAWS)
 def test_a_policy_does_what_its_law_does(environment, scenario, observe, uniform, law):
     """Reading observations by name gives the law what the simulator's arrays hold, to float32."""
@@ -162,7 +162,7 @@ def test_what_a_policy_is_told_holds_no_environment():
             waiting += list(value)
 
 
-@pytest.mark.parametrize(("environment", "scenario"), EVERY)
+@pytest.mark.parametrize(("environment", "scenario"), EVERY_ALONG_EDGES)
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_makes_progress_everywhere(environment, scenario, law):
     """With the shipped parameters: much nearer to the goal than at the start, close to the result in oracle mode."""
@@ -180,7 +180,7 @@ def test_every_law_makes_progress_everywhere(environment, scenario, law):
     assert estimate.max_error_to_bound.max() < 1.0
 
 
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize("environment", ALONG_EDGES)
 def test_doing_nothing_or_anything_loses(environment):
     env = batched(environment, "convoy", num_envs=16)
     returns = {name: play(env, make_policy(name), range(16)).returns for name in (*LAWS, "zero", "random")}

@@ -12,18 +12,34 @@ import gymnasium
 import numpy as np
 
 import khop_env
+from khop_env.catalog import gymnasium_id
 from khop_env.env import SHARED_INFOS, BatchedEnv, KHopEnv
-from khop_env.registry import scenario
+from khop_env.registry import find_task, scenario
 from khop_env.scenarios import Scenario
+from khop_env.tasks import EdgeTask
 from khop_env.testing import CHECKS, check_environment, difference
 
 ENVIRONMENTS = khop_env.environments()
 SCENARIOS = ("paper", "convoy", "mixed_fleet", "random_geometric:agents=12")
-INFO_KEYS = ("task_error", *SHARED_INFOS)
 MODES = ("estimate", "oracle", "local")
 EVERY = list(itertools.product(ENVIRONMENTS, SCENARIOS))
 CROSS = list(itertools.product(ENVIRONMENTS, SCENARIOS, MODES, (True, False)))  # ..., observe, uniform
-IDS = dict(zip(ENVIRONMENTS, ("khop/Consensus-v0", "khop/Formation-v0", "khop/LeaderFollowing-v0"), strict=True))
+ALONG_EDGES = tuple(name for name in ENVIRONMENTS if issubclass(find_task(name), EdgeTask))
+EVERY_ALONG_EDGES = list(itertools.product(ALONG_EDGES, SCENARIOS))
+CROSS_ALONG_EDGES = [each for each in CROSS if each[0] in ALONG_EDGES]
+IDS = {name: gymnasium_id(name) for name in ENVIRONMENTS}
+
+
+@cache
+def info_keys(environment: str) -> tuple[str, ...]:
+    """Keys of an environment's infos, in their order: the task's, then those that all share."""
+    env = batched(environment)
+    return (*env.task.evaluate(env.world).infos, *SHARED_INFOS)
+
+
+def ends_within(environment: str, radius: float) -> dict[str, float]:
+    """The argument with which episodes terminate when every agent's task error is at most `radius`, in m."""
+    return {"success_radius" if environment in ALONG_EDGES else "goal_radius": radius}
 
 
 @cache

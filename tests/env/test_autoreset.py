@@ -18,7 +18,7 @@ from gymnasium.wrappers.vector import (
 
 from khop_env import make_vec
 from khop_env.env.vector import _WRAPPERS_MISCOUNT
-from tests.env.playing import INFO_KEYS, built, same
+from tests.env.playing import built, info_keys, same
 
 COPIES = 3
 
@@ -54,7 +54,7 @@ def test_the_same_as_gymnasium_s_own(mode):
 
     def require_same(rows, infos, observations, its):
         assert rows.reshape(COPIES, -1).tobytes() == observations.tobytes()
-        for key in INFO_KEYS:
+        for key in info_keys("formation_v0"):
             np.testing.assert_array_equal(infos[f"_{key}"], np.repeat(its[f"_{key}"], agents))
         error = infos["task_error"].reshape(COPIES, -1).mean(axis=1)
         np.testing.assert_array_equal(error, its["task_error"])
@@ -178,7 +178,7 @@ def test_an_ended_copy_waits_for_the_next_step():
     for part in (slice(8), slice(16, 24)):
         assert rows[part].tobytes() == expected[part].tobytes()
         assert rewards[part].tobytes() == its_rewards[part].tobytes()
-    assert all(infos[f"_{key}"].all() for key in INFO_KEYS)
+    assert all(infos[f"_{key}"].all() for key in info_keys("consensus_v0"))
     env.step(actions[1])
     np.testing.assert_allclose(env.batched.simulator.t, [0.15, 0.05, 0.15])
 

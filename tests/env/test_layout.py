@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from khop_env.tasks import EdgeTask
 from tests.env.playing import EVERY, batched, built, parallel, play
 from tests.strategies import definition_of_m
 
@@ -64,6 +65,16 @@ def known_state(env, i, j, hops):
     return simulator.estimates[0, first : first + len(truth)]
 
 
+def expected_of_task(env, i):
+    """What navigation adds: the goal, and the agents' size."""
+    task, fleet = env.batched.task, env.batched.fleet
+    if isinstance(task, EdgeTask):
+        return {}
+    gap = task.memory["goal"][i, :, 0] - env.batched.simulator.x[0, fleet.position_index[i]]
+    goal = {f"goal.{axis}": gap[c] for c, axis in enumerate(AXES[: fleet.position_dim])}
+    return {**goal, "radius": task.arena.radius}
+
+
 def own_bounds(env, i, j):
     """[M_j^-1 rho_j]_i, the bounds on the errors of agent i's estimate of j, one per state, from the definitions."""
     simulator, model = env.batched.simulator, env.batched.fleet.models[j]
@@ -96,7 +107,8 @@ def expected_slot(env, i, number, j, hops, wanted):
     if env.batched.settings.uniform and len(types) > 1:
         values |= {f"{name}.type.{kind}": float(kind == model.type) for kind in types}
     for c, axis in enumerate(AXES[: fleet.position_dim]):
-        values[f"{name}.displacement.{axis}"] = displacement[c]
+        if isinstance(task, EdgeTask):
+            values[f"{name}.displacement.{axis}"] = displacement[c]
         values[f"{name}.position.{axis}"] = known[model.position_index[c]] - own[c]
     values |= expected_state(model, known, name)
     if env.batched.settings.bounds:
@@ -120,7 +132,7 @@ def test_every_field_holds_what_its_name_says(environment, name, observe, unifor
             seen = layout.read(env.observe(agent))
             order, hops, wanted = order_of_slots(env, i)
             assert [slot.agent for slot in layout.slots] == order
-            expected = expected_own(env, i)
+            expected = expected_own(env, i) | expected_of_task(env, i)
             for number, j in enumerate(order):
                 expected |= expected_slot(env, i, number, j, hops, wanted)
                 slot = layout.slots[number]

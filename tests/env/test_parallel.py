@@ -240,7 +240,7 @@ def test_settings_of_any_size_are_refused_before_anything_is_built(settings, mes
         consensus_v0.parallel_env(**settings)
 
 
-@pytest.mark.parametrize("max_cycles", [True, 2.0, "5", None])
+@pytest.mark.parametrize("max_cycles", [True, 2.0, "5", 0])
 def test_cycles_are_whole_numbers(max_cycles):
     with pytest.raises(ValueError, match="max_cycles must be a positive integer; got"):
         parallel("consensus_v0", max_cycles=max_cycles)

@@ -11,7 +11,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from khop_env import make_sb3_vec, make_vec
-from tests.env.playing import EVERY, INFO_KEYS, built, same
+from tests.env.playing import EVERY, built, ends_within, info_keys, same
 
 COPIES = 2
 
@@ -28,8 +28,8 @@ def actions_for(env, cycles):
 @pytest.mark.parametrize(("environment", "name"), EVERY)
 def test_rows_are_those_of_the_gymnasium_environment(environment, name):
     """Observations, rewards and ends bit for bit (rewards as float32), in SB3's conventions."""
-    radius = {"consensus_v0": 1.9, "formation_v0": 2.3, "leader_following_v0": 2.0}[environment]
-    arguments = {"max_cycles": 5, "success_radius": radius * (3.0 if name == "mixed_fleet" else 1.0)}
+    radius = {"consensus_v0": 1.9, "formation_v0": 2.3, "leader_following_v0": 2.0, "navigation_v0": 2.9}[environment]
+    arguments = {"max_cycles": 5, **ends_within(environment, radius * (3.0 if name == "mixed_fleet" else 1.0))}
     env, other = (
         sb3(environment, name, **arguments),
         make_vec(environment, COPIES, autoreset_mode="same_step", scenario=built(name), **arguments),
@@ -46,10 +46,10 @@ def test_rows_are_those_of_the_gymnasium_environment(environment, name):
             if not dones[row]:
                 assert info == {}
                 continue
-            assert set(info) == {"terminal_observation", "TimeLimit.truncated", "episode", *INFO_KEYS}
+            assert set(info) == {"terminal_observation", "TimeLimit.truncated", "episode", *info_keys(environment)}
             assert info["terminal_observation"].tobytes() == infos_2["final_obs"][row].tobytes()
             assert info["TimeLimit.truncated"] is bool(truncated[row])
-            for key in INFO_KEYS:
+            for key in info_keys(environment):
                 assert info[key] == infos_2["final_info"][key][row]
 
 

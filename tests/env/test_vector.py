@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 
 from khop_env import make_vec
 from khop_env.testing import arrays
-from tests.env.playing import EVERY, INFO_KEYS, built, parallel, same
+from tests.env.playing import EVERY, built, ends_within, info_keys, parallel, same
 
 COPIES, CYCLES = 3, 17
 every = pytest.mark.parametrize(("environment", "name"), EVERY)
@@ -41,16 +41,17 @@ def require_same_rows(env, b, rows, by_agent):
 def test_rows_are_agents_of_single_environments(environment, name, actuator):
     """Row b * N + i is agent i of a ParallelEnv with seed + b, over several episodes, whose ends are in final_obs."""
     # with a success radius the copies end at different times, some by termination and some by truncation
-    radius = {"consensus_v0": 1.9, "formation_v0": 2.3, "leader_following_v0": 2.0}[environment]
+    radius = {"consensus_v0": 1.9, "formation_v0": 2.3, "leader_following_v0": 2.0, "navigation_v0": 2.9}[environment]
     radius *= 3.0 if name == "mixed_fleet" else 1.0
-    arguments = {"max_cycles": 6, "success_radius": radius, "actuator": actuator, "observe": "estimate", "bounds": True}
+    arguments = {"max_cycles": 6, "actuator": actuator, "observe": "estimate", "bounds": True}
+    arguments |= ends_within(environment, radius)
     env, others = vector(environment, name, **arguments), singles(environment, name, COPIES, **arguments)
     count = len(env.batched.agents)
     rows, infos = env.reset(seed=11)
     for b, other in enumerate(others):
         observations, its = other.reset(seed=11 + b)
         require_same_rows(env, b, rows, observations)
-        for key in INFO_KEYS:
+        for key in info_keys(environment):
             require_same_rows(env, b, infos[key], {agent: its[agent][key] for agent in its})
     ended = 0
     for actions in actions_for(env, CYCLES):
@@ -70,15 +71,15 @@ def test_rows_are_agents_of_single_environments(environment, name, actuator):
             if over:
                 ended += 1
                 require_same_rows(env, b, infos["final_obs"], observations)
-                for key in INFO_KEYS:
+                for key in info_keys(environment):
                     require_same_rows(env, b, infos["final_info"][key], {one: its[one][key] for one in its})
                 observations, its = other.reset()
             elif "final_obs" in infos:
                 assert not infos["_final_obs"][part].any()
                 assert all(one is None for one in infos["final_obs"][part])
-                assert not any(infos["final_info"][f"_{key}"][part].any() for key in INFO_KEYS)
+                assert not any(infos["final_info"][f"_{key}"][part].any() for key in info_keys(environment))
             require_same_rows(env, b, rows, observations)
-            for key in INFO_KEYS:
+            for key in info_keys(environment):
                 require_same_rows(env, b, infos[key], {one: its[one][key] for one in its})
                 assert infos[f"_{key}"].all()
     assert ended >= 2 * COPIES

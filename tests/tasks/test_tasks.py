@@ -10,9 +10,9 @@ from khop_env import leader_following_v0
 from khop_env.observers import Exponential, ObserverDesign
 from khop_env.physics import Fleet, SingleIntegrator
 from khop_env.tasks import Formation, World
-from tests.env.playing import ENVIRONMENTS, EVERY, SCENARIOS, batched, built, parallel, play, random_actions
+from tests.env.playing import ALONG_EDGES, EVERY_ALONG_EDGES, SCENARIOS, batched, built, parallel, play, random_actions
 
-every = pytest.mark.parametrize(("environment", "name"), EVERY)
+every = pytest.mark.parametrize(("environment", "name"), EVERY_ALONG_EDGES)
 scenarios = pytest.mark.parametrize("name", SCENARIOS)
 
 
@@ -60,7 +60,7 @@ def test_a_team_reward_is_the_mean_of_all(environment, name):
         assert len(set(mine[1].values())) > 1
 
 
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize("environment", ALONG_EDGES)
 def test_success_terminates_when_the_worst_agent_is_near_enough(environment):
     """Exactly when no task error exceeds the radius; that isn't a truncation, even at the horizon."""
     env = parallel(environment, max_cycles=30)

@@ -1,0 +1,155 @@
+"""Towards the goal, whoever is in the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from agents.policy import EnvDescription, Observations
+from agents.scripted import Reader
+from agents.velocity_law import VELOCITY_INPUTS
+from khop_env.env.layout import Float32Array
+from khop_env.observers import FloatArray
+from khop_env.physics import AgentModel, Fleet, velocity_to_input
+
+GAIN = 5.0  # 1/s, where the input is a velocity
+SLOW_GAIN = 1.0  # 1/s, where it is a force or an acceleration
+TURN_GAIN = 4.0  # 1/s
+RANGE = 1.5  # m: others that are farther don't matter
+TURN = 2.0  # most that another turns an agent, as the tangent of the angle
+STUCK = 0.05  # m
+
+
+class GoToGoal:
+    """Straight to the goal at full speed, without regard for others: the wish that a safety filter corrects.
+
+    The commanded velocity is the gain times the way that is left. Where the input is a velocity it is shortened to the
+    input limits without a change of direction, and a known drift is cancelled; unicycles turn towards the goal while
+    they drive; carts and vessels follow the command by `physics.velocity_to_input`.
+    """
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Find the goals in the observations.
+
+        Raises:
+            ValueError: if an agent has no goal.
+        """
+        self._fleet, self._sizes = Fleet(list(env.models.values())), env.action_sizes
+        self._reader = Reader(env, self._fleet)
+        self._models = dict(env.models)
+        self._goal = {}
+        for agent, layout in env.layouts.items():
+            names = [name for name in layout.names if name.startswith("goal.")]
+            if len(names) != self._fleet.position_dim:
+                raise ValueError(
+                    f"go_to_goal needs an environment with goals, e.g. navigation_v0: the observation of {agent!r} in "
+                    f"{env.environment} has no columns goal.x, goal.y"
+                )
+            self._goal[agent] = layout.columns("goal")
+
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        """Inputs as fractions of their limits."""
+        shape = next(iter(observations.values())).shape[:-1]
+        flat = np.concatenate(
+            [np.asarray(observations[agent]).reshape(-1, observations[agent].shape[-1]) for agent in self._models],
+            axis=1,
+        )
+        states = self._reader.view(flat, None).x
+        actions = {}
+        for i, (agent, model) in enumerate(self._models.items()):
+            seen = np.asarray(observations[agent], dtype=float).reshape(len(flat), -1)
+            way = self.way(agent, states[:, self._fleet.position_index[i]], seen)
+            u = towards(model, states[:, self._fleet.state_slice(i)], way)
+            actions[agent] = np.zeros((len(flat), self._sizes[agent]), np.float32)
+            actions[agent][:, : model.m] = u / model.input_limit
+            actions[agent] = actions[agent].reshape(*shape, -1)
+        return actions
+
+    def way(self, agent: str, position: FloatArray, seen: FloatArray) -> FloatArray:
+        """Where an agent is to go, (B, d) in m, from where it is.
+
+        Args:
+            agent: its id.
+            position: (B, d) in m.
+            seen: (B, D) its observations.
+        """
+        return seen[:, self._goal[agent]]
+
+
+class KeepRight(GoToGoal):
+    """To the goal, passing others on the right, and aside for a while if nothing moves: fewer deadlocks in a filter.
+
+    Of the others ahead, by their estimates, the nearest turns an agent to the right, the more the nearer it is within
+    `RANGE`. An agent that has moved by less than `STUCK` in 1 s, and isn't at its goal, goes in a random direction for
+    0.5 to 1.5 s, and then tries again for at least 1 s. In the plane.
+    """
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Find the goals and the others in the observations, and seed the generators.
+
+        Raises:
+            ValueError: if an agent has no goal, or positions aren't in the plane.
+        """
+        super().reset(env, seeds)
+        if self._fleet.position_dim != 2:
+            raise ValueError(f"keep_right needs positions in the plane; here they have {self._fleet.position_dim} axes")
+        self._others, self._known = {}, {}
+        for agent, layout in env.layouts.items():
+            slots = range(len(layout.slots))
+            self._others[agent] = np.array([layout.columns(f"slot{q}.position") for q in slots], int).reshape(-1, 2)
+            self._known[agent] = np.array([layout.index(f"slot{q}.valid") for q in slots], int)
+        self._generators = [np.random.default_rng(int(seed)) for seed in seeds]
+        self._second = max(1, round(1.0 / env.control_period))
+        self._period = env.control_period
+        self._past: dict[str, list[FloatArray]] = {agent: [] for agent in env.layouts}
+        self._detour = {agent: np.zeros((len(seeds), 2)) for agent in env.layouts}
+        self._left = {agent: np.full(len(seeds), -1.0) for agent in env.layouts}  # s, of a detour; since it ended
+
+    def way(self, agent: str, position: FloatArray, seen: FloatArray) -> FloatArray:
+        """See the class."""
+        way = super().way(agent, position, seen)
+        distance = np.hypot(way[:, 0], way[:, 1])
+        ahead = way / np.maximum(distance, 1e-9)[:, None]
+        others = seen[:, self._others[agent]]  # (B, slots, 2)
+        far = np.hypot(others[..., 0], others[..., 1])
+        counted = (seen[:, self._known[agent]] > 0.5) & ((others * ahead[:, None]).sum(axis=2) > 0.0)
+        nearest = np.where(counted, far, RANGE).min(axis=1, initial=RANGE)
+        near_goal = np.minimum(distance / RANGE, 1.0)  # nobody circles round its goal
+        turn = (TURN * (1.0 - nearest / RANGE) * near_goal)[:, None]
+        way = way + turn * distance[:, None] * np.column_stack([ahead[:, 1], -ahead[:, 0]])
+        past, left, detour = self._past[agent], self._left[agent], self._detour[agent]
+        past.append(position.copy())
+        if len(past) > self._second:
+            moved = np.hypot(*(position - past.pop(0)).T)
+            for env in np.flatnonzero((moved < STUCK) & (distance > STUCK) & (left <= -1.0)).tolist():
+                angle = self._generators[env].uniform(0.0, 2.0 * math.pi)
+                detour[env] = math.cos(angle), math.sin(angle)
+                left[env] = self._generators[env].uniform(0.5, 1.5)
+        aside = left > 0.0
+        left -= self._period
+        return np.where(aside[:, None], detour, way)
+
+
+def towards(model: AgentModel, x: FloatArray, way: FloatArray) -> FloatArray:
+    """Inputs (B, m), within the limits, that move agents of a model along `way`.
+
+    Args:
+        model: the agents' common model.
+        x: (B, n) their states.
+        way: (B, d) from their positions to their goals, in m.
+    """
+    if model.type in VELOCITY_INPUTS:
+        drift = model.drift(np.zeros(len(x)), x)
+        u = GAIN * way
+        room = np.maximum(model.input_limit - np.abs(drift), 0.0)  # what the drift leaves of the limits
+        u *= (room / np.maximum(np.abs(u), 1e-9)).min(axis=1, initial=1.0, keepdims=True)
+        return np.clip(u - drift, -model.input_limit, model.input_limit)
+    if model.type == "unicycle":
+        distance = np.hypot(way[:, 0], way[:, 1])
+        turn = np.arctan2(way[:, 1], way[:, 0]) - x[:, 2]
+        turn = np.where(distance > 1e-3, (turn + math.pi) % (2.0 * math.pi) - math.pi, 0.0)
+        u = np.column_stack([GAIN * distance * np.maximum(np.cos(turn), 0.0), TURN_GAIN * turn])
+        return np.clip(u, -model.input_limit, model.input_limit)
+    return velocity_to_input(model, x, SLOW_GAIN * way)

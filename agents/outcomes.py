@@ -1,0 +1,127 @@
+"""Outcomes of episodes in which agents may collide: from the infos "cost", "arrived" and "min_distance"."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from khop_env.env import BatchedEnv
+from khop_env.observers import FloatArray
+
+STILL = 0.1  # m: agents that move less in `STILL_TIME` don't move
+STILL_TIME = 2.0  # s
+Z95 = 1.959963984540054  # quantile of the normal distribution
+
+
+class Outcomes:
+    """Measures B episodes, step by step.
+
+    Args:
+        env: reset.
+        infos: of the reset.
+    """
+
+    def __init__(self, env: BatchedEnv, infos: Mapping[str, NDArray[Any]]) -> None:
+        batch, agents, period = env.num_envs, len(env.agents), env.settings.control_period
+        self._env, self._period = env, period
+        self._present = {"cost", "arrived", "min_distance"} <= set(infos)
+        self._members = [env.fleet.agent(agent) for agent in env.agents]
+        self._places: deque[FloatArray] = deque(maxlen=max(2, round(STILL_TIME / period) + 1))
+        self._first = np.full((batch, agents), math.inf)  # s, of arrival
+        self._values = {
+            "collision": np.zeros(batch),
+            "success": np.zeros(batch),
+            "arrival_time": np.full(batch, math.nan),
+            "min_distance": np.full(batch, math.inf),
+            "deadlock": np.zeros(batch),
+        }
+        self._changed, self._steps = np.zeros(batch), np.zeros(batch)
+        self._filtered = False
+
+    def add(
+        self,
+        cycle: int,
+        running: NDArray[np.bool_],
+        over: NDArray[np.bool_],
+        infos: Mapping[str, NDArray[Any]],
+        intervention: Mapping[str, FloatArray] | None,
+    ) -> None:
+        """Take account of a control period.
+
+        Args:
+            cycle: its number, from 1.
+            running: (B,) environments whose episode was running until now.
+            over: (B,) environments whose episode ends with it.
+            infos: after it.
+            intervention: by agent (B,), how much a filter changed the policy's inputs; None without a filter.
+        """
+        if not self._present:
+            return
+        values, arrived = self._values, infos["arrived"] > 0.5
+        self._first = np.where(arrived & np.isinf(self._first), cycle * self._period, self._first)
+        values["collision"][running & (infos["cost"] > 0.0).any(axis=1)] = 1.0
+        nearest = np.minimum(values["min_distance"], infos["min_distance"].min(axis=1))
+        values["min_distance"] = np.where(running, nearest, values["min_distance"])
+        if intervention is not None:
+            self._filtered = True
+            self._changed += np.where(running, np.mean(list(intervention.values()), axis=0), 0.0)
+            self._steps += running
+        self._places.append(self._env.world.positions()[self._members])
+        ended = running & over
+        if not ended.any():
+            return
+        everybody = arrived.all(axis=1)
+        mean = np.where(everybody, self._first.mean(axis=1), math.nan)
+        values["arrival_time"] = np.where(ended, mean, values["arrival_time"])
+        values["success"] = np.where(ended, everybody & (values["collision"] == 0.0), values["success"])
+        if len(self._places) == self._places.maxlen:
+            moved = np.sqrt(((self._places[-1] - self._places[0]) ** 2).sum(axis=1)).T  # (B, N)
+            still = (moved < STILL).all(axis=1) & ~everybody
+            values["deadlock"] = np.where(ended, still, values["deadlock"])
+
+    def result(self) -> dict[str, FloatArray]:
+        """(E,) measurements by name; none in an environment without collisions."""
+        if not self._present:
+            return {}
+        return {
+            **self._values,
+            "intervention": self._changed / self._steps if self._filtered else np.full(len(self._steps), math.nan),
+        }
+
+
+def summary(values: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """Rates, means and extremes over episodes; None where there is none.
+
+    Args:
+        values: of `Outcomes.result`, of any number of episodes.
+    """
+    if not values:
+        return {}
+    times, filtered = values["arrival_time"][values["success"] > 0.5], ~np.isnan(values["intervention"])
+    return {
+        "collision_rate": float(values["collision"].mean()),
+        "collision_ci95": wilson95(values["collision"]),
+        "success_rate": float(values["success"].mean()),
+        "success_ci95": wilson95(values["success"]),
+        "arrival_time": float(times.mean()) if times.size else None,
+        "min_distance": float(values["min_distance"].min()),
+        "deadlock_rate": float(values["deadlock"].mean()),
+        "deadlock_ci95": wilson95(values["deadlock"]),
+        "intervention": float(values["intervention"].mean()) if filtered.all() else None,
+    }
+
+
+def wilson95(values: FloatArray | Sequence[float]) -> list[float]:
+    """Wilson's 95 % interval [low, high] of a rate, from zeros and ones.
+
+    Source: E. B. Wilson, Probable Inference, the Law of Succession, and Statistical Inference, JASA 22, 1927.
+    """
+    count, rate = len(values), float(np.mean(values))
+    center = (rate + Z95**2 / (2 * count)) / (1 + Z95**2 / count)
+    half = Z95 / (1 + Z95**2 / count) * math.sqrt(rate * (1 - rate) / count + Z95**2 / (4 * count**2))
+    return [0.0 if rate == 0.0 else max(0.0, center - half), 1.0 if rate == 1.0 else min(1.0, center + half)]

@@ -1,0 +1,72 @@
+"""Agents cross a square to random goals."""
+
+from __future__ import annotations
+
+import inspect
+import math
+
+import numpy as np
+
+from khop_env.scenarios.scenario import Scenario
+from khop_env.scenarios.teams import named, require_agents, team
+from khop_env.simulation import Arena
+
+
+def crossing(
+    agents: int = 8,
+    speed: float = 1.0,
+    radius: float = 0.2,
+    model: str = "integrator",
+    graph: str = "tree",
+    disturbance: float = 0.1,
+    loss: float = 0.3,
+    burst: float = 5.0,
+    continuous: bool = False,
+    duration: float = 15.0,
+    seed: int = 0,
+) -> Scenario:
+    """Agents in a square go to random goals in it.
+
+    Positions at the start are at least 1 m apart, and so are goals (5 radii, if agents are larger than by default). The
+    square has sides of 1.6 sqrt(N) m. Agents are out of range of most others' radios, and estimate them from messages
+    that are passed on. Hard: `crossing:agents=16,duration=30`.
+
+    Args:
+        agents: N, 4 to 1000.
+        speed: limit on an agent's speed along each axis, in m/s.
+        radius: of an agent in m.
+        model: "integrator", "drifter", "cart", "unicycle" or "vessel", for all agents.
+        graph: of communication: "tree" (random, for 8 agents the paper's), "ring", or "regular3", where all have 3
+            links.
+        disturbance: amplitude of a sinusoid in m/s along each axis (on accelerations, in m/s^2, where there are some).
+        loss: mean share of lost messages, of which every agent sends 20 a second.
+        burst: mean number of messages lost in a row.
+        continuous: exchange in continuous time instead, without messages: the paper's observers and their bounds.
+        duration: of an episode in s.
+        seed: of the graph.
+
+    Raises:
+        ValueError: for numbers out of range, or an unknown model or graph.
+    """
+    chosen = dict(locals())
+    require_agents("crossing", agents, even=False)
+    scale = max(1.0, radius / 0.2)
+    center = np.zeros((agents, 2))
+    half_width = np.full((agents, 2), 0.8 * math.sqrt(agents) * scale)
+    arena = Arena(radius, apart=scale, goals="random")
+    return team(
+        named("crossing", chosen, {key: each.default for key, each in inspect.signature(crossing).parameters.items()}),
+        f"{agents} agents in a square go to random goals: for navigation",
+        center,
+        half_width,
+        arena,
+        speed=speed,
+        model=model,
+        graph=graph,
+        disturbance=disturbance,
+        loss=loss,
+        burst=burst,
+        continuous=continuous,
+        duration=duration,
+        seed=seed,
+    )

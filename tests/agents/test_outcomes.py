@@ -1,0 +1,133 @@
+"""Collisions, arrivals and deadlocks of episodes, against loops over a ParallelEnv; several networks in one table."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+from typer.testing import CliRunner
+
+from agents import compare, describe, make_policy, play
+from agents.outcomes import wilson95
+from agents.policy import policy_seeds
+from khop_env import make_batched, navigation_v0
+from khop_env.cli import app
+
+
+class Slowed:
+    """Towards the goal at a third of the speed, by something that changes what another policy wants."""
+
+    def __init__(self):
+        self._policy, self.intervention = make_policy("go_to_goal"), {}
+
+    def reset(self, env, seeds):
+        self._policy.reset(env, seeds)
+
+    def act(self, observations):
+        wanted = self._policy.act(observations)
+        actions = {agent: action / np.float32(3.0) for agent, action in wanted.items()}
+        self.intervention = {agent: np.linalg.norm(wanted[agent] - actions[agent], axis=-1) for agent in wanted}
+        return actions
+
+
+@pytest.mark.parametrize(("name", "make"), [("crossing:agents=4", Slowed), ("swap:agents=4", Slowed)])
+def test_outcomes_measured_by_hand(name, make):
+    """Every number, of episodes that collide and of some that don't."""
+    arguments = {"max_cycles": 120, "bonus": 0.0}
+    found = play(make_batched("navigation_v0", name, num_envs=3, **arguments), make(), range(8)).outcomes
+    env = navigation_v0.parallel_env(name, **arguments)
+    for seed in range(8):
+        policy = make()
+        policy.reset(describe(env), policy_seeds([seed]))
+        observations, _ = env.reset(seed=seed)
+        first, distance, cost, changed, cycle = {}, math.inf, 0.0, [], 0
+        while env.agents:
+            actions = policy.act(observations)
+            changed.append(np.mean(list(policy.intervention.values())))
+            observations, _, _, _, infos = env.step(actions)
+            cycle += 1
+            distance = min([distance, *(info["min_distance"] for info in infos.values())])
+            cost += sum(info["cost"] for info in infos.values())
+            for agent, info in infos.items():
+                if info["arrived"]:
+                    first.setdefault(agent, 0.05 * cycle)
+        there = all(info["arrived"] for info in infos.values())
+        assert found["collision"][seed] == (cost > 0.0)
+        assert found["success"][seed] == (there and cost == 0.0)
+        assert found["min_distance"][seed] == pytest.approx(distance, rel=1e-12)
+        assert found["intervention"][seed] == pytest.approx(np.mean(changed), rel=1e-6)
+        expected = np.mean(list(first.values())) if there else math.nan
+        np.testing.assert_allclose(found["arrival_time"][seed], expected)
+        assert found["deadlock"][seed] == 0.0
+    assert found["collision"].any()
+    assert name.startswith("swap") or found["success"].any()
+
+
+def test_who_does_not_move_is_in_a_deadlock_and_who_is_slow_is_not():
+    still = make_batched("navigation_v0", "crossing:disturbance=0", num_envs=4, max_cycles=60)
+    assert play(still, make_policy("zero"), range(4)).outcomes["deadlock"].tolist() == [1.0] * 4
+    assert play(still, make_policy("random"), range(4)).outcomes["deadlock"].tolist() == [0.0] * 4
+    short = make_batched("navigation_v0", "crossing:disturbance=0", num_envs=4, max_cycles=30)  # too short to tell
+    assert play(short, make_policy("zero"), range(4)).outcomes["deadlock"].tolist() == [0.0] * 4
+
+
+def test_rates_and_times_of_a_row():
+    """Means over episodes; times over those that succeed; nothing in environments without collisions."""
+    table = compare("navigation_v0", ["go_to_goal", "zero"], scenario="crossing:agents=4", seeds=range(30))
+    row, idle = (each.summary() for each in table.rows)
+    outcomes = table.rows[0].episodes.outcomes
+    assert 0.0 < row["collision_rate"] == outcomes["collision"].mean() < 1.0
+    assert row["success_rate"] == outcomes["success"].mean() == pytest.approx(1.0 - row["collision_rate"])
+    assert row["arrival_time"] == outcomes["arrival_time"][outcomes["success"] == 1.0].mean()
+    assert row["min_distance"] == outcomes["min_distance"].min() < 0.4
+    assert row["intervention"] is None
+    assert idle["arrival_time"] is None
+    assert table.frame()["collision"].sum() == outcomes["collision"].sum()
+    assert compare("consensus_v0", ["zero"], seeds=range(2)).rows[0].episodes.outcomes == {}
+
+
+@pytest.mark.parametrize(("ones", "count"), [(0, 200), (3, 40), (100, 100), (20, 60)])
+def test_intervals_are_wilson_s(ones, count):
+    low, high = wilson95([1.0] * ones + [0.0] * (count - ones))
+    expected = binomtest(ones, count).proportion_ci(method="wilson")
+    assert (low, high) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+def test_several_networks_in_one_table():
+    """The same rows as one at a time; networks are in the labels, in JSON and in the frame."""
+    arguments = {"arguments": {"max_cycles": 30}, "seeds": range(3)}
+    networks = ["ideal", "lossy:loss=0.5,burst=4"]
+    table = compare("consensus_v0", ["tanh", "zero"], networks=networks, **arguments)
+    assert [row.network for row in table.rows] == networks * 2
+    assert table.rows[1].label == "tanh on estimate over lossy:loss=0.5,burst=4"
+    assert table.frame()["network"].to_list() == [name for name in networks * 2 for _ in range(3)]
+    for number, network in enumerate(networks):
+        alone = compare("consensus_v0", ["tanh"], arguments={"max_cycles": 30, "network": network}, seeds=range(3))
+        np.testing.assert_array_equal(table.rows[number].episodes.returns, alone.rows[0].episodes.returns)
+        assert "network" not in alone.rows[0].summary()
+    with pytest.raises(ValueError, match="networks must be names, and arguments without a network then"):
+        compare("consensus_v0", ["tanh"], networks=networks, arguments={"network": "wifi"})
+
+
+def test_the_command_prints_rates_and_networks():
+    def khop(*words):
+        fixed = ["evaluate", "navigation_v0", "--episodes", "2", "--observe", "estimate"]
+        return CliRunner().invoke(app, [*fixed, *words])
+
+    result = khop("--network", "ideal,lossy:loss=0.3,burst=5", "--json", "--env", "max_cycles=20")
+    rows = json.loads(result.stdout)["rows"]
+    assert [(row["policy"], row["network"]) for row in rows] == [
+        (policy, network)
+        for policy in ("go_to_goal", "zero", "random")
+        for network in ("ideal", "lossy:loss=0.3,burst=5")
+    ]
+    measured = {"collision_rate", "success_rate", "arrival_time", "min_distance", "deadlock_rate", "intervention"}
+    assert measured < set(rows[0])
+    table = khop("--policies", "zero", "--env", "max_cycles=20").stdout
+    assert "navigation_v0 on crossing over a network (a message every 50 ms" in table
+    assert "collided" in table
+    assert "deadlock" in table
+    refused = khop("--network", "ideal", "--env", "network=wifi")
+    assert refused.exit_code == 2
+    assert "--env network and --network: choose one of them" in refused.output
