@@ -1,0 +1,174 @@
+"""Tables of the columns that a safety filter reads, and checks of what its theorem assumes.
+
+docs/theory_safety.md has the theorem, and where each margin comes from.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from agents.policy import EnvDescription
+from agents.safe_moves import Columns
+from khop_env.env import ObservationLayout
+from khop_env.observers import FloatArray, IntArray
+from khop_env.physics import AgentModel, SingleIntegrator
+
+Margin = str | float
+"""Half width of the box round an estimate: "certified" for its certified bounds, "none" for 0, or a number of m."""
+
+FLOAT32 = 2.0**-24  # relative rounding of an observation or an action
+SLACK = 1e-6  # m: for what the computation of a move rounds, in more periods than an episode has
+
+
+def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> Columns:
+    """The tables of the compiled part.
+
+    Args:
+        env: the environment.
+        margin: round estimates.
+        radius: of an agent's body in m.
+
+    Raises:
+        ValueError: if agents, columns or margins don't fit.
+    """
+    if radius is None:
+        raise ValueError(f"{env.environment} says nothing of agents' bodies: give radius=, e.g. radius=0.2")
+    certified = margin == "certified"
+    constant = 0.0 if isinstance(margin, str) else margin
+    tracking: dict[str, FloatArray] = {}  # largest distance between an agent and its anchor
+    for agent, model in env.models.items():
+        _require_integrator(agent, model, env.layouts[agent])
+        tracking[agent] = _tracking(agent, env)
+    own, first, start = [], [0], 0
+    pairs: list[tuple[IntArray, FloatArray, IntArray, FloatArray, int, FloatArray, float]] = []
+    for agent, layout in env.layouts.items():
+        if certified:
+            _require_all_known(agent, layout, env)
+        place = _own(agent, env)
+        own.append((start + place, layout.high[place].astype(float), 1.01 * (tracking[agent] + _rounding(agent, env))))
+        for number, slot in enumerate(layout.slots):
+            name, other = f"slot{number}", tracking.get(slot.id, np.zeros(2))
+            place = layout.columns(f"{name}.position")
+            bound, highest = np.full(2, -1), np.full(2, math.inf)
+            if certified:
+                bound = np.array([layout.index(f"{name}.bound.{axis}") for axis in env.models[slot.id].position])
+                bound, highest = start + bound, layout.high[bound].astype(float)
+            by_messages = f"{name}.age" in layout.names  # then boxes are right before anything has arrived, too
+            valid = -1 if certified and by_messages else start + layout.index(f"{name}.valid")
+            widen = constant + other + _rounding(agent, env)
+            apart = 2.0 * radius + float(np.linalg.norm(tracking[agent]) + np.linalg.norm(other)) + SLACK
+            pairs.append((start + place, layout.high[place].astype(float), bound, highest, valid, widen, apart))
+        first.append(len(pairs))
+        start += len(layout)
+    if not pairs:
+        raise ValueError(f"{env.environment} on {env.scenario} has no slots: nobody knows of anybody")
+    columns, limits, tracked = map(np.array, zip(*own, strict=True))
+    position, position_limit, bounds, bound_limit, valid_column, widened, distance = map(
+        np.array, zip(*pairs, strict=True)
+    )
+    speed = np.array([env.models[agent].input_limit for agent in env.agents], float)
+    return Columns(
+        columns,
+        limits,
+        np.array(first),
+        position,
+        position_limit,
+        bounds,
+        bound_limit,
+        valid_column,
+        certified,
+        widened,
+        distance,
+        speed,
+        tracked,
+    )
+
+
+def without_bounds(env: EnvDescription) -> tuple[dict[str, np.ndarray], EnvDescription]:
+    """An environment as it is described without bounds in its observations.
+
+    Returns:
+        By agent the columns (D_i,) that are left, and the description; no columns where there were no bounds anyway.
+    """
+    kept, layouts = {}, {}
+    longest = max(env.layouts.values(), key=lambda layout: len(layout.slots))
+    padded = len({len(layout) for layout in env.layouts.values()}) == 1  # then slots are at the same columns for all
+    for agent, layout in env.layouts.items():
+        names = longest.names if padded else layout.names
+        kept[agent] = np.array([q for q, name in enumerate(names) if not _is_bound(name)], np.int64)
+        if len(kept[agent]) == len(names):
+            return {}, env
+        fields = [layout.fields[q] for q in kept[agent]]
+        layouts[agent] = ObservationLayout(agent, fields, layout.slots)
+    return kept, replace(env, layouts=layouts)
+
+
+def _own(agent: str, env: EnvDescription) -> IntArray:
+    """(2,) columns of an agent's own position."""
+    return np.array([env.layouts[agent].index(f"own.{axis}") for axis in env.models[agent].position])
+
+
+def _rounding(agent: str, env: EnvDescription) -> FloatArray:
+    """(2,) largest rounding of an agent's own position in observations, in m."""
+    return FLOAT32 * env.layouts[agent].high[_own(agent, env)].astype(float)
+
+
+def _tracking(agent: str, env: EnvDescription) -> FloatArray:
+    """(2,) largest distance per axis between an agent and its anchor, in m.
+
+    Raises:
+        ValueError: if its inputs don't suffice to keep it there, or its disturbance isn't known.
+    """
+    if agent not in env.disturbance:
+        raise ValueError(f"the description says nothing of the disturbance of {agent!r}; use agents.describe(env)")
+    speed, period = np.asarray(env.models[agent].input_limit, float), env.control_period
+    pushed = np.asarray(env.disturbance[agent], float)
+    found: FloatArray = pushed * period + _rounding(agent, env) + FLOAT32 * speed * period
+    if not (1.01 * (found + _rounding(agent, env)) <= speed * period).all():
+        raise ValueError(
+            f"{agent!r} can't hold its place: it is pushed at up to {pushed.max():g} m/s, and its inputs are limited "
+            f"to {speed.min():g} m/s"
+        )
+    return found
+
+
+def _is_bound(name: str) -> bool:
+    slot, _, rest = name.partition(".")
+    return slot.startswith("slot") and rest.startswith("bound.")
+
+
+def _require_integrator(agent: str, model: AgentModel, layout: ObservationLayout) -> None:
+    if not isinstance(model, SingleIntegrator) or model.dim != 2:
+        raise ValueError(
+            f"the safety filter is for single integrators in the plane, SingleIntegrator(dim=2); {agent!r} is a "
+            f"{type(model).__name__}" + (f" of dimension {model.dim}" if isinstance(model, SingleIntegrator) else "")
+        )
+    if any(name.startswith("own.input") for name in layout.names):
+        raise ValueError(
+            f"the safety filter needs inputs that are the actions: make the environment with actuator='direct'; the "
+            f"inputs of {agent!r} are states"
+        )
+
+
+def _require_all_known(agent: str, layout: ObservationLayout, env: EnvDescription) -> None:
+    """Refuse what the theorem doesn't cover."""
+    if env.observe == "local":
+        raise ValueError(
+            "margin='certified' needs observe='estimate' or 'oracle': with 'local' most agents are unknown"
+        )
+    if layout.slots and not any(_is_bound(name) for name in layout.names):
+        raise ValueError("margin='certified' reads certified bounds: make the environment with bounds=True")
+    others = {slot.id for slot in layout.slots}
+    if strangers := sorted(others - set(env.agents)):
+        raise ValueError(
+            f"margin='certified' needs everybody to run the filter, and {', '.join(strangers[:4])} doesn't act; choose "
+            "a margin of some metres, without a guarantee"
+        )
+    if unknown := [each for each in env.agents if each != agent and each not in others]:
+        raise ValueError(
+            f"margin='certified' needs everybody to know of everybody, and {agent!r} doesn't know of "
+            f"{', '.join(unknown[:4])}: they are more than k hops away; choose a scenario with a larger k"
+        )
