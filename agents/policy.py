@@ -33,7 +33,6 @@ class EnvDescription:
         action_sizes: number of entries of each agent's action, padding included, by id.
         error_unit: unit of the task error.
         disturbance: bound on |w| of each acting agent by id, (n,) in state units per second.
-        radius: of an agent's body in m, where the task has one (its attribute `radius`).
     """
 
     environment: str
@@ -45,7 +44,6 @@ class EnvDescription:
     action_sizes: Mapping[str, int]
     error_unit: str = "m"
     disturbance: Mapping[str, FloatArray] = field(default_factory=dict)
-    radius: float | None = None
 
     __repr__ = brief
 
@@ -99,7 +97,6 @@ def describe(env: object) -> EnvDescription:
         action_sizes=dict(zip(batched.agents, sizes.tolist(), strict=True)),
         error_unit=batched.task.error_unit(batched.world),
         disturbance={agent: pushed[fleet.state_slice(fleet.agent(agent))] for agent in batched.agents},
-        radius=getattr(batched.task, "radius", None),
     )
 
 

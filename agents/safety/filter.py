@@ -13,8 +13,8 @@ import numpy as np
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import EnvDescription, Observations, Policy
-from agents.safe_moves import filter_moves
-from agents.safety_columns import Margin, read_columns, without_bounds
+from agents.safety.columns import Margin, read_columns, without_bounds
+from agents.safety.moves import filter_moves
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray
 
@@ -50,7 +50,7 @@ class SafetyFilter:
         policy: the policy inside; it gets the observations without bounds, unless it was trained with them.
         margin: a `Margin`.
         gamma: share of the gap that two agents may use up in a period together, above 0 and at most 1.
-        radius: of an agent's body in m; None for the environment's.
+        radius: of an agent's body in m; None for the column `radius` of observations.
         bounds: whether the policy inside observes bounds; None for what a learned policy was trained with, and no
             bounds for others.
 
@@ -58,7 +58,8 @@ class SafetyFilter:
         policy: the policy inside.
         needs_bounds: whether the environment must be made with bounds=True.
         wanted: by agent (..., m), the actions of the policy inside, of the last `act`.
-        intervention: by agent (...), distance between wanted and chosen input in m/s, of the last `act`.
+        correction: by agent (..., 2), chosen less wanted input in m/s, of the last `act`.
+        intervention: by agent (...), its length.
         infeasible: by agent (...), True where the guarantee had to be begun anew: an agent that isn't where its last
             input should have brought it, which then starts from where it is, or that is outside of what observations
             show, which then stops. It is never True while the theorem's assumptions hold.
@@ -84,6 +85,7 @@ class SafetyFilter:
         self.radius, self._bounds = radius, bounds
         self.needs_bounds = self.margin == "certified"
         self.wanted: dict[str, Float32Array] = {}
+        self.correction: dict[str, FloatArray] = {}
         self.intervention: dict[str, FloatArray] = {}
         self.infeasible: dict[str, np.ndarray] = {}
 
@@ -97,7 +99,7 @@ class SafetyFilter:
             ValueError: if the filter or the policy inside doesn't fit the environment; the message says why.
         """
         self._env = env
-        columns = read_columns(env, self.margin, env.radius if self.radius is None else self.radius)
+        columns = read_columns(env, self.margin, self.radius)
         self._columns: Any = tuple(columns)
         self._speed = columns.speed
         self._anchor, self._started = np.zeros((0, 0, 2)), np.zeros((0, 0), np.bool_)
@@ -140,13 +142,15 @@ class SafetyFilter:
             chosen,
             infeasible,
         )
-        change = np.linalg.norm(chosen - wanted, axis=2)
+        correction = chosen - wanted
+        change = np.linalg.norm(correction, axis=2)
         safe = np.where((change > 0.0)[..., None], chosen / speed, fractions).astype(np.float32)
         actions = {}
         for number, agent in enumerate(agents):
             action = np.array(self.wanted[agent], np.float32).reshape(batch, -1)
             action[:, :2] = safe[:, number]
             actions[agent] = action.reshape(*shape, -1)
+            self.correction[agent] = correction[:, number].reshape(*shape, 2)
             self.intervention[agent] = change[:, number].reshape(shape)
             self.infeasible[agent] = infeasible[:, number].reshape(shape)
         return actions

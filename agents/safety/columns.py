@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from agents.policy import EnvDescription
-from agents.safe_moves import Columns
+from agents.safety.moves import Columns
 from khop_env.env import ObservationLayout
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import AgentModel, SingleIntegrator
@@ -20,7 +20,6 @@ Margin = str | float
 """Half width of the box round an estimate: "certified" for its certified bounds, "none" for 0, or a number of m."""
 
 FLOAT32 = 2.0**-24  # relative rounding of an observation or an action
-SLACK = 1e-6  # m: for what the computation of a move rounds, in more periods than an episode has
 
 
 def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> Columns:
@@ -29,26 +28,25 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> C
     Args:
         env: the environment.
         margin: round estimates.
-        radius: of an agent's body in m.
+        radius: of an agent's body in m; None for what observations say.
 
     Raises:
         ValueError: if agents, columns or margins don't fit.
     """
-    if radius is None:
-        raise ValueError(f"{env.environment} says nothing of agents' bodies: give radius=, e.g. radius=0.2")
     certified = margin == "certified"
     constant = 0.0 if isinstance(margin, str) else margin
     tracking: dict[str, FloatArray] = {}  # largest distance between an agent and its anchor
     for agent, model in env.models.items():
         _require_integrator(agent, model, env.layouts[agent])
         tracking[agent] = _tracking(agent, env)
-    own, first, start = [], [0], 0
+    own, of_bodies, first, start = [], [], [0], 0
     pairs: list[tuple[IntArray, FloatArray, IntArray, FloatArray, int, FloatArray, float]] = []
     for agent, layout in env.layouts.items():
         if certified:
             _require_all_known(agent, layout, env)
         place = _own(agent, env)
         own.append((start + place, layout.high[place].astype(float), 1.01 * (tracking[agent] + _rounding(agent, env))))
+        of_bodies.append(_bodies(agent, env, start, radius))
         for number, slot in enumerate(layout.slots):
             name, other = f"slot{number}", tracking.get(slot.id, np.zeros(2))
             place = layout.columns(f"{name}.position")
@@ -59,14 +57,15 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> C
             by_messages = f"{name}.age" in layout.names  # then boxes are right before anything has arrived, too
             valid = -1 if certified and by_messages else start + layout.index(f"{name}.valid")
             widen = constant + other + _rounding(agent, env)
-            apart = 2.0 * radius + float(np.linalg.norm(tracking[agent]) + np.linalg.norm(other)) + SLACK
+            apart = float(np.linalg.norm(tracking[agent]) + np.linalg.norm(other))
             pairs.append((start + place, layout.high[place].astype(float), bound, highest, valid, widen, apart))
         first.append(len(pairs))
         start += len(layout)
     if not pairs:
         raise ValueError(f"{env.environment} on {env.scenario} has no slots: nobody knows of anybody")
     columns, limits, tracked = map(np.array, zip(*own, strict=True))
-    position, position_limit, bounds, bound_limit, valid_column, widened, distance = map(
+    radius_column, obstacle = map(np.array, zip(*of_bodies, strict=True))
+    position, position_limit, bounds, bound_limit, valid_column, widened, distances = map(
         np.array, zip(*pairs, strict=True)
     )
     speed = np.array([env.models[agent].input_limit for agent in env.agents], float)
@@ -81,7 +80,12 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> C
         valid_column,
         certified,
         widened,
-        distance,
+        radius_column,
+        math.nan if radius is None else radius,
+        distances,
+        obstacle,
+        np.array([_rounding(agent, env) for agent in env.agents]),
+        np.array([np.linalg.norm(tracking[agent]) for agent in env.agents]),
         speed,
         tracked,
     )
@@ -109,6 +113,20 @@ def without_bounds(env: EnvDescription) -> tuple[dict[str, np.ndarray], EnvDescr
 def _own(agent: str, env: EnvDescription) -> IntArray:
     """(2,) columns of an agent's own position."""
     return np.array([env.layouts[agent].index(f"own.{axis}") for axis in env.models[agent].position])
+
+
+def _bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -> tuple[int, IntArray]:
+    """The column of the bodies' radius, -1 if it is given, and (M, 2) those of obstacles' nearest points."""
+    layout = env.layouts[agent]
+    names, axes = set(layout.names), env.models[agent].position
+    column = -1
+    if radius is None:
+        if "radius" not in names:
+            raise ValueError(f"observations of {env.environment} don't say how large agents are: give radius= in m")
+        column = start + layout.index("radius")
+    count = next(q for q in range(len(names)) if f"obstacle{q}.{axes[0]}" not in names)
+    places = [[start + layout.index(f"obstacle{q}.{axis}") for axis in axes] for q in range(count)]
+    return column, np.array(places, np.int64).reshape(-1, 2)
 
 
 def _rounding(agent: str, env: EnvDescription) -> FloatArray:

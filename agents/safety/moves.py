@@ -1,6 +1,6 @@
-"""Compiled part of the safety filter: the move nearest to the wanted one that keeps a distance to boxes of others.
+"""Compiled loop of the safety filter over environments, agents and slots.
 
-docs/theory_safety.md has the program and why its rows imply it. Lengths are in m, moves are of one control period.
+docs/theory_safety.md has the program. Lengths are in m, moves are of one control period.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.safety.rows import MOST_ROWS, TOLERANCE, box_rows, nearest_move, obstacle_rows
 from khop_env.compiled import compiled
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray, IntArray
 
-SECTOR = math.pi / 24.0  # largest angle between two rows of one box
-MOST_ROWS = 25  # of one box, which is seen under less than half a turn from outside
-TOLERANCE = 1e-12  # m: rows that are broken by less count as kept; `SafetyFilter` has a margin of a micrometre for it
+SLACK = 1e-6  # m: added to distances for that, and for rounding, of more periods than an episode has
 EPSILON = 2.0**-23  # twice the relative rounding of a float32
 ROUNDED = 1.0 + EPSILON
 
@@ -36,7 +35,12 @@ class Columns(NamedTuple):
         valid: (P,) column of the flag that something is known; -1 where the bound says all.
         unknown_stops: whether an agent of which nothing is known stops this one, instead of being left out.
         widen: (P, 2) half widths that are added to each bound.
-        distance: (P,) that the anchors have to keep.
+        radius: (N,) column of the radius of the agents' bodies; -1 where it is `body`.
+        body: radius in m.
+        apart: (P,) distance that the anchors have to keep, less two radii.
+        obstacle: (N, M, 2) columns of the vectors to the nearest points of static convex obstacles.
+        rounding: (N, 2) of observed positions.
+        off: (N,) largest distance from the anchor by the theory.
         speed: (N, 2) input limits in m/s.
         tracking: (N, 2) largest observed distance from the anchor by the theory, per axis.
     """
@@ -51,121 +55,14 @@ class Columns(NamedTuple):
     valid: IntArray
     unknown_stops: bool
     widen: FloatArray
-    distance: FloatArray
+    radius: IntArray
+    body: float
+    apart: FloatArray
+    obstacle: IntArray
+    rounding: FloatArray
+    off: FloatArray
     speed: FloatArray
     tracking: FloatArray
-
-
-@compiled
-def box_rows(
-    x: float, y: float, hx: float, hy: float, distance: float, gamma: float, reach: float, rows: FloatArray, used: int
-) -> int:
-    """Rows (a_x, a_y, b), each a . z <= b >= 0, that keep a move z away from every point of a box.
-
-    They imply e . z <= gamma max(|y| - distance, 0) / 2 for every point y = |y| e of the box, and are written only
-    where a move of length `reach` could break them.
-
-    Args:
-        x: the box's centre, from the anchor that moves.
-        y: likewise.
-        hx: its half widths.
-        hy: likewise.
-        distance: to be kept.
-        gamma: share of the gap that both agents together may use up.
-        reach: length of the longest move.
-        rows: (R, 3) written from row `used` on.
-        used: rows that are in use.
-
-    Returns:
-        Rows that are in use then; -1 if the anchor is inside the box, which leaves only z = 0.
-    """
-    near_x = min(max(0.0, x - hx), x + hx)  # the box's point nearest to the anchor
-    near_y = min(max(0.0, y - hy), y + hy)
-    nearest = math.sqrt(near_x * near_x + near_y * near_y)
-    if 0.5 * gamma * (nearest - distance) >= reach:
-        return used
-    if nearest == 0.0:
-        return -1
-    low, high = 0.0, 0.0  # angles of the corners, from the direction of the nearest point
-    for corner in range(4):
-        cx = x + (hx if corner & 1 else -hx)
-        cy = y + (hy if corner & 2 else -hy)
-        angle = math.atan2(near_x * cy - near_y * cx, near_x * cx + near_y * cy)
-        low, high = min(low, angle), max(high, angle)
-    sectors = max(1, math.ceil((high - low) / SECTOR))
-    step = (high - low) / sectors
-    shrink = 0.5 * gamma * math.cos(0.5 * step)
-    middle = min(max(math.floor(-low / step), 0), sectors - 1) if step > 0.0 else 0  # holds the nearest point
-    cos, sin = math.cos(low), math.sin(low)
-    ax, ay = (near_x * cos - near_y * sin) / nearest, (near_y * cos + near_x * sin) / nearest
-    cos, sin = math.cos(step), math.sin(step)
-    before = math.inf  # the largest move towards the sector before this ray
-    previous = nearest  # distance along the ray before
-    for k in range(sectors + 1):
-        along = ray_distance(x, y, hx, hy, ax, ay, nearest)
-        if k > 0:  # sector k - 1, between the ray before and this one; its inner ray is nearer to `middle`
-            inner = nearest if k - 1 == middle else (along if k - 1 < middle else previous)
-            after = shrink * max(inner - distance, 0.0)
-            # the ray before has both its sectors now
-            bound = min(before, after)
-            if bound < reach:
-                rows[used, 2] = bound
-                used += 1
-            before = after
-        rows[used, 0], rows[used, 1] = ax, ay
-        previous = along
-        ax, ay = ax * cos - ay * sin, ay * cos + ax * sin
-    if before < reach and step > 0.0:
-        rows[used, 2] = before
-        used += 1
-    return used
-
-
-@compiled
-def ray_distance(x: float, y: float, hx: float, hy: float, ax: float, ay: float, otherwise: float) -> float:
-    """Distance to a box along a ray from the origin; `otherwise` where rounding lets the ray pass it."""
-    enter, leave = 0.0, math.inf
-    for axis in range(2):
-        a, middle, half = (ax, x, hx) if axis == 0 else (ay, y, hy)
-        if a == 0.0:
-            if abs(middle) > half:
-                return otherwise
-            continue
-        one, two = (middle - half) / a, (middle + half) / a
-        enter, leave = max(enter, min(one, two)), min(leave, max(one, two))
-    return max(enter, otherwise) if enter <= leave else otherwise
-
-
-@compiled
-def nearest_move(rows: FloatArray, used: int, wx: float, wy: float) -> tuple[float, float]:
-    """The point nearest to (wx, wy) with a . z <= b for rows (a_x, a_y, b), b >= 0 and |a| = 1, in any order.
-
-    Incremental projection in two dimensions: if a row is broken, the new optimum lies on its line. What rounding leaves
-    is removed by scaling towards z = 0, which all rows admit.
-    """
-    zx, zy = wx, wy
-    for m in range(used):
-        ax, ay, b = rows[m, 0], rows[m, 1], rows[m, 2]
-        if ax * zx + ay * zy <= b + TOLERANCE:
-            continue
-        low, high = -math.inf, math.inf
-        px, py = ax * b, ay * b
-        for k in range(m):
-            slope = rows[k, 1] * ax - rows[k, 0] * ay
-            room = rows[k, 2] - rows[k, 0] * px - rows[k, 1] * py
-            if slope > 1e-14:
-                high = min(high, room / slope)
-            elif slope < -1e-14:
-                low = max(low, room / slope)
-        along = ax * wy - ay * wx
-        along = min(max(along, low), high) if low <= high else 0.5 * (low + high)
-        zx, zy = px - ay * along, py + ax * along
-    scale = 1.0
-    for m in range(used):
-        ahead = rows[m, 0] * zx + rows[m, 1] * zy
-        if ahead > rows[m, 2] + TOLERANCE:
-            scale = min(scale, rows[m, 2] / ahead)
-    return scale * zx, scale * zy
 
 
 @compiled
@@ -199,7 +96,8 @@ def filter_moves(
     most = 0
     for i in range(agents):
         most = max(most, columns.first[i + 1] - columns.first[i])
-    rows = np.empty((4 + most * MOST_ROWS + 2, 3))
+    obstacles = columns.obstacle.shape[1]
+    rows = np.empty((4 + 2 * obstacles + most * MOST_ROWS + 1, 3))
     for b in range(observations.shape[0]):
         for i in range(agents):
             px, py = float(observations[b, columns.own[i, 0]]), float(observations[b, columns.own[i, 1]])
@@ -224,7 +122,23 @@ def filter_moves(
                 rows[row, row // 2] = 1.0 if row % 2 == 0 else -1.0
             rows[0, 2], rows[1, 2] = max(most_x + off_x, 0.0), max(most_x - off_x, 0.0)
             rows[2, 2], rows[3, 2] = max(most_y + off_y, 0.0), max(most_y - off_y, 0.0)
+            radius = columns.body
+            if columns.radius[i] >= 0:
+                radius = ROUNDED * float(observations[b, columns.radius[i]])
+            turn = 2.0 * math.asin(min(1.0, 0.5 * columns.off[i] / radius))
+            for q in range(obstacles):
+                x = float(observations[b, columns.obstacle[i, q, 0]])
+                y = float(observations[b, columns.obstacle[i, q, 1]])
+                near = math.sqrt(x * x + y * y)
+                if near == 0.0 or turn >= 0.5 * math.pi:
+                    used = -1
+                    break
+                x, y = x / near, y / near
+                ahead = near * (1.0 - EPSILON) + x * off_x + y * off_y - columns.rounding[i, 0] - columns.rounding[i, 1]
+                used = obstacle_rows(x, y, ahead, radius + columns.off[i] + SLACK, turn, reach, rows, used)
             for pair in range(columns.first[i], columns.first[i + 1]):
+                if used < 0:
+                    break
                 known = columns.valid[pair] < 0 or observations[b, columns.valid[pair]] > 0.5
                 if not known and not columns.unknown_stops:
                     continue
@@ -241,9 +155,8 @@ def filter_moves(
                     break
                 half_x = hx * ROUNDED + abs(x) * EPSILON + columns.widen[pair, 0]
                 half_y = hy * ROUNDED + abs(y) * EPSILON + columns.widen[pair, 1]
-                used = box_rows(x + off_x, y + off_y, half_x, half_y, columns.distance[pair], gamma, reach, rows, used)
-                if used < 0:
-                    break
+                distance = 2.0 * radius + columns.apart[pair] + SLACK
+                used = box_rows(x + off_x, y + off_y, half_x, half_y, distance, gamma, reach, rows, used)
             broken = used < 0
             for m in range(4, used):
                 broken = broken or rows[m, 0] * wx + rows[m, 1] * wy > rows[m, 2] + TOLERANCE
