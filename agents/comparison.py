@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.evaluation import Episodes, chosen_scenario, play
-from agents.learning.learned import LearnedPolicy
-from agents.policies import make_policy
+from agents.policies import make_policy, needs_bounds
 from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
@@ -149,7 +148,7 @@ def compare(
         workers: number of processes; results don't depend on it.
         ray: run on a Ray cluster instead (an existing one, or a local one).
         arguments: further arguments of the environment, e.g. {"max_cycles": 100}. A learned policy that was trained
-            with bounds in its observations always gets them.
+            with bounds in its observations, or is in a certified filter, always gets them.
         progress: called with the completed fraction.
 
     Raises:
@@ -172,7 +171,7 @@ def compare(
     rows: list[tuple[str, EnvDescription, bool]] = []
     for spec in policies:  # check that each policy fits before the first episode
         policy = make_policy(spec)
-        bounds = isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
+        bounds = needs_bounds(policy)
         for mode in observe:
             env = describe(player.environment(mode, bounds))
             rows.append((spec, env, bounds))

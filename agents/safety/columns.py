@@ -122,7 +122,10 @@ def _bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -
     column = -1
     if radius is None:
         if "radius" not in names:
-            raise ValueError(f"observations of {env.environment} don't say how large agents are: give radius= in m")
+            raise ValueError(
+                f"observations of {env.environment} have no column 'radius', so that it isn't known how large agents "
+                "are: give SafetyFilter or shielded() radius=, in m"
+            )
         column = start + layout.index("radius")
     count = next(q for q in range(len(names)) if f"obstacle{q}.{axes[0]}" not in names)
     places = [[start + layout.index(f"obstacle{q}.{axis}") for axis in axes] for q in range(count)]

@@ -15,10 +15,12 @@ from khop_env.commands.common import (
     EstimatorOption,
     JsonOption,
     NetworkOption,
+    ShieldOption,
     load,
     mistakes,
     print_json,
     require_figure,
+    shielded_name,
     with_network,
 )
 from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
@@ -35,7 +37,7 @@ def evaluate(
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
-            "classes of your own, my_file.py:MyPolicy."
+            "classes of your own, my_file.py:MyPolicy; any of them in a safety filter, shield:certified:tanh."
         ),
     ] = "tanh,linear,zero,random",
     observe: Annotated[
@@ -43,6 +45,7 @@ def evaluate(
     ] = "estimate,oracle,local",
     network: NetworkOption = None,
     estimator: EstimatorOption = None,
+    shield: ShieldOption = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each row, the same for all.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
     env: EnvOption = None,
@@ -74,7 +77,7 @@ def evaluate(
             try:
                 comparison = compare(
                     environment,
-                    split_specs(policies, "--policies", "policy"),
+                    [shielded_name(policy, shield) for policy in split_specs(policies, "--policies", "policy")],
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
                     scenario=chosen,
                     arguments=arguments,
