@@ -14,10 +14,13 @@ from agents.policy import EnvDescription
 from agents.safety.moves import Columns
 from khop_env.env import ObservationLayout
 from khop_env.observers import FloatArray, IntArray
-from khop_env.physics import AgentModel, SingleIntegrator
+from khop_env.physics import AgentModel, DriftingIntegrator, SingleIntegrator
 
 Margin = str | float
 """Half width of the box round an estimate: "certified" for its certified bounds, "none" for 0, or a number of m."""
+
+DRIFT: dict[type[AgentModel], float] = {SingleIntegrator: 0.0, DriftingIntegrator: 1.0}
+"""Agents whose velocity is their input and a drift, with the largest drift in m/s."""
 
 FLOAT32 = 2.0**-24  # relative rounding of an observation or an action
 
@@ -145,13 +148,17 @@ def _tracking(agent: str, env: EnvDescription) -> FloatArray:
     """
     if agent not in env.disturbance:
         raise ValueError(f"the description says nothing of the disturbance of {agent!r}; use agents.describe(env)")
-    speed, period = np.asarray(env.models[agent].input_limit, float), env.control_period
-    pushed = np.asarray(env.disturbance[agent], float)
+    model, period = env.models[agent], env.control_period
+    speed, pushed = np.asarray(model.input_limit, float), np.asarray(env.disturbance[agent], float)
+    growth, drift = model.drift_growth(), DRIFT[type(model)]
+    assert growth is not None
+    reach = (speed + drift + pushed) * period + _rounding(agent, env)
+    pushed = pushed + growth.matrix @ reach  # the drift isn't what it was at the beginning of the period
     found: FloatArray = pushed * period + _rounding(agent, env) + FLOAT32 * speed * period
-    if not (1.01 * (found + _rounding(agent, env)) <= speed * period).all():
+    if not (1.01 * (found + _rounding(agent, env)) + drift * period <= speed * period).all():
         raise ValueError(
-            f"{agent!r} can't hold its place: it is pushed at up to {pushed.max():g} m/s, and its inputs are limited "
-            f"to {speed.min():g} m/s"
+            f"{agent!r} can't hold its place: it is pushed at up to {pushed.max() + drift:g} m/s, and its inputs are "
+            f"limited to {speed.min():g} m/s"
         )
     return found
 
@@ -162,10 +169,11 @@ def _is_bound(name: str) -> bool:
 
 
 def _require_integrator(agent: str, model: AgentModel, layout: ObservationLayout) -> None:
-    if not isinstance(model, SingleIntegrator) or model.dim != 2:
+    if type(model) not in DRIFT or len(model.position) != 2:
         raise ValueError(
-            f"the safety filter is for single integrators in the plane, SingleIntegrator(dim=2); {agent!r} is a "
-            f"{type(model).__name__}" + (f" of dimension {model.dim}" if isinstance(model, SingleIntegrator) else "")
+            "the safety filter is for integrators in the plane, SingleIntegrator(dim=2) and DriftingIntegrator(); "
+            f"{agent!r} is a {type(model).__name__}"
+            + (f" of dimension {model.dim}" if isinstance(model, SingleIntegrator) else "")
         )
     if any(name.startswith("own.input") for name in layout.names):
         raise ValueError(

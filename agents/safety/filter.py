@@ -17,6 +17,7 @@ from agents.safety.columns import Margin, read_columns, without_bounds
 from agents.safety.moves import filter_moves
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray
+from khop_env.physics import SingleIntegrator
 
 
 def as_margin(margin: Margin) -> Margin:
@@ -42,9 +43,9 @@ class SafetyFilter:
         policy = shielded("tanh", margin=0.3, radius=0.2)            # a constant margin: no guarantee
 
     It reads observations only, as a policy does, and remembers each agent's anchor: where its moves so far would have
-    brought it without a disturbance. Agents have to be single integrators in the plane whose inputs are their actions
-    (actuator="direct"). With margin="certified" the distance is kept whatever the network does, provided that all
-    agents run the filter and start apart (docs/theory_safety.md); with other margins it is not.
+    brought it without a disturbance. Agents have to be integrators in the plane, with a drift or without, whose inputs
+    are their actions (actuator="direct"). With margin="certified" the distance is kept whatever the network does,
+    provided that all agents run the filter and start apart (docs/theory_safety.md); with other margins it is not.
 
     Args:
         policy: the policy inside; it gets the observations without bounds, unless it was trained with them.
@@ -101,7 +102,9 @@ class SafetyFilter:
         self._env = env
         columns = read_columns(env, self.margin, self.radius)
         self._columns: Any = tuple(columns)
-        self._speed = columns.speed
+        self._speed, self._own = columns.speed, columns.own
+        models = enumerate(env.models.values())
+        self._drifting = {number: model for number, model in models if not isinstance(model, SingleIntegrator)}
         self._anchor, self._started = np.zeros((0, 0, 2)), np.zeros((0, 0), np.bool_)
         self._kept, inside = without_bounds(env)
         if self._observes_bounds(env):
@@ -135,6 +138,7 @@ class SafetyFilter:
             self._columns,
             flat,
             wanted,
+            self._drift(flat),
             self._env.control_period,
             self.gamma,
             self._anchor,
@@ -154,6 +158,14 @@ class SafetyFilter:
             self.intervention[agent] = change[:, number].reshape(shape)
             self.infeasible[agent] = infeasible[:, number].reshape(shape)
         return actions
+
+    def _drift(self, flat: Float32Array) -> FloatArray:
+        """(B, N, 2) velocities of agents without an input."""
+        places = flat[:, self._own].astype(float)
+        drift = np.zeros_like(places)
+        for number, model in self._drifting.items():
+            drift[:, number] = model.drift(np.zeros(len(flat)), places[:, number])
+        return drift
 
     # -- the environment -----------------------------------------------------------------------------------------
 

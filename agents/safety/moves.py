@@ -70,6 +70,7 @@ def filter_moves(
     columns: Any,
     observations: Float32Array,
     wanted: FloatArray,
+    drift: FloatArray,
     period: float,
     gamma: float,
     anchor: FloatArray,
@@ -83,6 +84,7 @@ def filter_moves(
         columns: the fields of `Columns` as a plain tuple.
         observations: (B, D) of all agents, side by side.
         wanted: (B, N, 2) wanted inputs in m/s, within the limits.
+        drift: (B, N, 2) velocity of an agent without an input, at its place, in m/s.
         period: the control period in s.
         gamma: share of the gap that two agents together may use up in a period.
         anchor: (B, N, 2) moved; set where an agent has none.
@@ -114,14 +116,15 @@ def filter_moves(
                 anchor[b, i, 0], anchor[b, i, 1] = px, py
                 off_x = off_y = 0.0
             most_x, most_y = columns.speed[i, 0] * period, columns.speed[i, 1] * period
-            wx, wy = wanted[b, i, 0] * period + off_x, wanted[b, i, 1] * period + off_y  # the anchor's wanted move
-            reach = math.sqrt((most_x + abs(off_x)) ** 2 + (most_y + abs(off_y)) ** 2)
+            to_x, to_y = off_x + drift[b, i, 0] * period, off_y + drift[b, i, 1] * period  # the anchor's without input
+            wx, wy = wanted[b, i, 0] * period + to_x, wanted[b, i, 1] * period + to_y
+            reach = math.sqrt((most_x + abs(to_x)) ** 2 + (most_y + abs(to_y)) ** 2)
             used = 4  # the input's limits
             for row in range(4):
                 rows[row, 0], rows[row, 1] = (0.0, 0.0)
                 rows[row, row // 2] = 1.0 if row % 2 == 0 else -1.0
-            rows[0, 2], rows[1, 2] = max(most_x + off_x, 0.0), max(most_x - off_x, 0.0)
-            rows[2, 2], rows[3, 2] = max(most_y + off_y, 0.0), max(most_y - off_y, 0.0)
+            rows[0, 2], rows[1, 2] = max(most_x + to_x, 0.0), max(most_x - to_x, 0.0)
+            rows[2, 2], rows[3, 2] = max(most_y + to_y, 0.0), max(most_y - to_y, 0.0)
             radius = columns.body
             if columns.radius[i] >= 0:
                 radius = ROUNDED * float(observations[b, columns.radius[i]])
@@ -164,7 +167,7 @@ def filter_moves(
                 zx = zy = 0.0
                 if used > 0:
                     zx, zy = nearest_move(rows, used, wx, wy)
-                chosen[b, i, 0], chosen[b, i, 1] = (zx - off_x) / period, (zy - off_y) / period
+                chosen[b, i, 0], chosen[b, i, 1] = (zx - to_x) / period, (zy - to_y) / period
             else:
                 zx, zy = wx, wy
                 chosen[b, i, 0], chosen[b, i, 1] = wanted[b, i, 0], wanted[b, i, 1]

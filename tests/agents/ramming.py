@@ -7,7 +7,7 @@ import numpy as np
 
 from agents import EnvDescription
 from khop_env.env.layout import Field, ObservationLayout, Slot
-from khop_env.physics import SingleIntegrator
+from khop_env.physics import AgentModel, SingleIntegrator
 
 PERIOD, SPEED, PUSHED, LIMIT = 0.05, 1.0, 0.1, 100.0
 
@@ -23,6 +23,7 @@ class Ramming:
         missing: half widths are observed smaller than the errors by this, in m.
         obstacles: (M, 3) discs x, y, radius.
         radius: of a body.
+        model: of all agents.
     """
 
     agents: int = 4
@@ -31,6 +32,7 @@ class Ramming:
     missing: float = 0.0
     radius: float = 0.2
     obstacles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    model: AgentModel = field(default_factory=lambda: SingleIntegrator(input_limit=SPEED))
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(0)
@@ -42,20 +44,21 @@ class Ramming:
 
     def description(self, age: bool = True) -> EnvDescription:
         """All agents know of each other."""
-        ids = [f"integrator_{i}" for i in range(self.agents)]
-        near = [f"obstacle{q}.{axis}" for q in range(len(self.obstacles)) for axis in "xy"]
+        ids = [f"{self.model.type}_{i}" for i in range(self.agents)]
+        axes = self.model.position
+        near = [f"obstacle{q}.{axis}" for q in range(len(self.obstacles)) for axis in axes]
         layouts = {}
         for i, agent in enumerate(ids):
-            fields = [Field(f"own.{axis}", "m", -LIMIT, LIMIT) for axis in "xy"] + [Field("radius", "m", 0.0, LIMIT)]
+            fields = [Field(f"own.{axis}", "m", -LIMIT, LIMIT) for axis in axes] + [Field("radius", "m", 0.0, LIMIT)]
             fields += [Field(name, "m", -2 * LIMIT, 2 * LIMIT) for name in near]
             slots = [Slot(j, other, False, 1, True) for j, other in enumerate(ids) if j != i]
             for number in range(len(slots)):
                 name = f"slot{number}"
                 fields += [Field(f"{name}.valid", "", 0.0, 1.0)] + [Field(f"{name}.age", "s", 0.0, LIMIT)] * age
                 fields += [Field(f"{name}.position.{axis}", "m", -2 * LIMIT, 2 * LIMIT) for axis in "xy"]
-                fields += [Field(f"{name}.bound.{axis}", "m", 0.0, LIMIT) for axis in "xy"]
+                fields += [Field(f"{name}.bound.{axis}", "m", 0.0, LIMIT) for axis in axes]
             layouts[agent] = ObservationLayout(agent, fields, slots)
-        models = {agent: SingleIntegrator(input_limit=SPEED) for agent in ids}
+        models = dict.fromkeys(ids, self.model)
         pushed = {agent: np.full(2, PUSHED) for agent in ids}
         sizes = dict.fromkeys(ids, 2)
         return EnvDescription("test_v0", "ring", "estimate", PERIOD, models, layouts, sizes, disturbance=pushed)
@@ -64,10 +67,11 @@ class Ramming:
         """Each pair's error is on a corner of its box, whose size jumps: both sides know differently much."""
         found = {}
         for i, (agent, layout) in enumerate(env.layouts.items()):
-            values = {"radius": self.radius, "own.x": self.x[:, i, 0], "own.y": self.x[:, i, 1]}
+            one, two = self.model.position
+            values = {"radius": self.radius, f"own.{one}": self.x[:, i, 0], f"own.{two}": self.x[:, i, 1]}
             gap = self.to_obstacles(self.x[:, i])
             for q in range(len(self.obstacles)):
-                values |= {f"obstacle{q}.{axis}": gap[:, q, c] for c, axis in enumerate("xy")}
+                values |= {f"obstacle{q}.{axis}": gap[:, q, c] for c, axis in enumerate((one, two))}
             for number, slot in enumerate(layout.slots):
                 size = self.largest * self.rng.random((self.batch, 2)) * self.rng.integers(0, 2, (self.batch, 1))
                 error = size * self.rng.choice([-1.0, 1.0], (self.batch, 2))
@@ -75,7 +79,7 @@ class Ramming:
                 seen = self.x[:, slot.agent] + error - self.x[:, i]
                 name = f"slot{number}"
                 values |= {f"{name}.valid": 1.0, f"{name}.position.x": seen[:, 0], f"{name}.position.y": seen[:, 1]}
-                values |= {f"{name}.bound.x": known[:, 0], f"{name}.bound.y": known[:, 1]}
+                values |= {f"{name}.bound.{one}": known[:, 0], f"{name}.bound.{two}": known[:, 1]}
                 values |= {f"{name}.age": 0.0} if f"{name}.age" in layout.names else {}
             found[agent] = layout.build(values)
         return found
@@ -99,12 +103,12 @@ class Ramming:
 
     def move(self, actions) -> None:
         """A period, with a disturbance towards the nearest that turns round halfway in some worlds."""
-        u = SPEED * np.clip(np.stack(list(actions.values()), axis=1).astype(float), -1.0, 1.0)
+        u = self.model.input_limit * np.clip(np.stack(list(actions.values()), axis=1).astype(float), -1.0, 1.0)
         push = PUSHED * np.sign(self.wanted())
         turns = self.rng.choice([-1.0, 1.0], (self.batch, 1, 1))
         for part, sign in enumerate((1.0, turns)):
             length = PERIOD * (0.5, 0.5)[part]
-            after = self.x + length * (u + sign * push)
+            after = self.x + length * (self.model.drift(np.zeros(self.batch), self.x) + u + sign * push)
             for i in range(self.agents):
                 for j in range(i):
                     self.closest = np.minimum(

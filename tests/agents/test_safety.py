@@ -7,6 +7,7 @@ import pytest
 
 from agents import SafetyFilter
 from khop_env.env.layout import ObservationLayout
+from khop_env.physics import DriftingIntegrator
 from tests.agents.ramming import PERIOD, PUSHED, SPEED, Ram, Ramming
 
 
@@ -32,6 +33,15 @@ def test_ramming_never_collides_with_errors_on_their_bounds(largest, gamma):
     assert rammed(world, gamma=gamma) == 0
     assert world.closest.min() >= 2.0 * world.radius
     assert world.closest.min() < 2.0 * world.radius + 0.04
+
+
+@pytest.mark.parametrize("largest", [0.0, 0.3])
+def test_integrators_with_a_drift_never_collide_either(largest):
+    """Which changes within a period; it is cancelled as it was at its beginning."""
+    world = Ramming(largest=largest, model=DriftingIntegrator(input_limit=3.0))
+    assert rammed(world) == 0
+    assert world.closest.min() >= 2.0 * world.radius
+    assert world.closest.min() < 2.0 * world.radius + 0.12
 
 
 def test_a_bound_too_small_by_one_period_collides():

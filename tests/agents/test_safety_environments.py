@@ -109,13 +109,13 @@ def test_columns_of_padded_slots_are_left_out_like_those_of_others():
         ({}, CIRCLE, {}, "make the environment with bounds=True"),
         ({"bounds": True, "actuator": "lag"}, CIRCLE, {}, "actuator='direct'; the inputs of 'integrator_0' are states"),
         ({"bounds": True, "observe": "local"}, CIRCLE, {}, "needs observe='estimate' or 'oracle'"),
-        ({"bounds": True}, "paper", {}, "'drifter_0' is a DriftingIntegrator"),
+        ({"bounds": True}, "mixed_fleet", {}, "'cart_0' is a DoubleIntegrator"),
         ({"bounds": True}, circle(5, k=2), {}, "'integrator_0' doesn't know of integrator_3, integrator_4"),
         (
             {},
             circle(disturbance=Sinusoid(1.0)),
             {"margin": "none"},
-            "pushed at up to 1 m/s, and its inputs are limited",
+            "pushed at up to 1 m/s, and its inputs are limited to 1",
         ),
     ],
 )

@@ -126,6 +126,11 @@ def test_from_inside_a_box_no_move_is_left():
     assert np.abs(nearest_move(rows, len(rows), 0.05, 0.02)).max() < 1e-9
 
 
+def test_a_move_that_comes_out_too_long_is_shortened():
+    """As rounding might make it; here by a row whose normal is too long."""
+    assert nearest_move(np.array([[2.0, 0.0, 1.0]]), 1, 3.0, 0.0) == (0.5, 0.0)
+
+
 def test_far_boxes_add_no_rows():
     """Where no move could break the constraint."""
     assert box_rows(3.0, 0.0, 1.0, 1.0, DISTANCE, 1.0, REACH, np.zeros((30, 3)), 4) == 4
