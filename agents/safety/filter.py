@@ -112,7 +112,11 @@ class SafetyFilter:
         self.policy.reset(inside, seeds)
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """The policy's actions where they are safe, otherwise the nearest safe ones."""
+        """The policy's actions where they are safe, otherwise the nearest safe ones; once in a control period.
+
+        Raises:
+            ValueError: if the policy inside leaves an agent out, or the batch has changed since the reset.
+        """
         agents, shape = self._env.agents, next(iter(observations.values())).shape[:-1]
         seen = observations
         if self._kept:
@@ -130,7 +134,7 @@ class SafetyFilter:
             if self._started.size:
                 raise ValueError(f"the batch of observations changed from {len(self._started)} to {batch}: reset first")
             self._anchor, self._started = np.zeros((batch, len(agents), 2)), np.zeros((batch, len(agents)), np.bool_)
-        fractions = np.stack([np.asarray(self.wanted[agent]).reshape(batch, -1)[:, :2] for agent in agents], axis=1)
+        fractions = np.stack([self._wanted(agent, batch) for agent in agents], axis=1)
         speed = self._speed
         wanted = np.clip(fractions, -1.0, 1.0, dtype=np.float64) * speed
         chosen, infeasible = np.empty_like(wanted), np.empty((batch, len(agents)), np.bool_)
@@ -158,6 +162,18 @@ class SafetyFilter:
             self.intervention[agent] = change[:, number].reshape(shape)
             self.infeasible[agent] = infeasible[:, number].reshape(shape)
         return actions
+
+    def _wanted(self, agent: str, batch: int) -> Float32Array:
+        """(B, 2) what the policy inside wants of an agent."""
+        if agent not in self.wanted:
+            raise ValueError(f"the policy inside the safety filter has no action for {agent!r}")
+        wanted, expected = np.asarray(self.wanted[agent], np.float32), (batch, self._env.action_sizes[agent])
+        if wanted.size != batch * expected[1]:
+            raise ValueError(
+                f"actions of {agent!r} must have shape {expected}, one row per environment; the policy inside the "
+                f"safety filter gave {wanted.shape}"
+            )
+        return wanted.reshape(expected)[:, :2]
 
     def _drift(self, flat: Float32Array) -> FloatArray:
         """(B, N, 2) velocities of agents without an input."""

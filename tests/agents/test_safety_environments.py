@@ -103,6 +103,32 @@ def test_columns_of_padded_slots_are_left_out_like_those_of_others():
         assert inside.layouts[agent].names == layout.names
 
 
+def test_a_policy_trained_without_bounds_acts_inside_with_bounds_around():
+    """It is refused if it is to get them."""
+    env = make_batched("consensus_v0", "paper", bounds=True)
+    policy = shielded("ppo:pretrained", 0.1, radius=0.05)
+    policy.reset(describe(env), [0])
+    observations, _ = env.reset(0)
+    assert all(np.isfinite(action).all() for action in policy.act(by_agent(env, observations)).values())
+    with pytest.raises(ValueError, match="trained on paper with"):
+        shielded("ppo:pretrained", 0.1, radius=0.05, bounds=True).reset(describe(env), [0])
+
+
+def test_a_policy_that_leaves_agents_out_is_named():
+    """Rather than a KeyError."""
+    env = make_batched(Bodies(), CIRCLE, bounds=True)
+    policy = shielded("zero")
+    policy.reset(describe(env), [0])
+    observations = by_agent(env, env.reset(0)[0])
+    for actions, message in (
+        ({}, "inside the safety filter has no action for 'integrator_0'"),
+        (dict.fromkeys(env.agents, np.zeros((1, 3))), r"must have shape \(1, 2\).* gave \(1, 3\)"),
+    ):
+        policy.policy.act = lambda observations, actions=actions: actions
+        with pytest.raises(ValueError, match=message):
+            policy.act(observations)
+
+
 @pytest.mark.parametrize(
     ("arguments", "scenario", "options", "message"),
     [
