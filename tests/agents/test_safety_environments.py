@@ -50,9 +50,10 @@ def circle(agents=8, k=6, **changes):
 CIRCLE = circle()
 
 
-def closest(margin, name="tanh", episodes=8, cycles=120):
-    """(E,) smallest distances of episodes over bursts of losses, at every instant."""
-    env = make_batched(Bodies(), CIRCLE, num_envs=episodes, network=BURSTS, estimator="relay", bounds=True)
+def closest(margin, name="tanh", network=BURSTS, episodes=8, cycles=120):
+    """(E,) smallest distances of episodes over a network, at every instant."""
+    estimator = None if network is None else "relay"
+    env = make_batched(Bodies(), CIRCLE, num_envs=episodes, network=network, estimator=estimator, bounds=True)
     policy = shielded(name, margin)
     policy.reset(describe(env), range(episodes))
     observations, _ = env.reset(0)
@@ -72,7 +73,20 @@ def test_over_bursts_of_losses_certified_bounds_keep_apart_and_estimates_do_not(
     """On the same episodes of agents that all want to be at one place."""
     assert closest("certified").min() >= 0.4
     assert (closest("none") < 0.4).all()
-    assert closest("certified", "bang_bang", cycles=60).min() >= 0.4
+
+
+@pytest.mark.parametrize(
+    ("name", "network"),
+    [
+        ("bang_bang", BURSTS),
+        ("tanh", f"{BURSTS},noise=0.05"),
+        ("tanh", "lossy:latency=0.12,jitter=0.1"),
+        ("tanh", None),
+    ],
+)
+def test_noise_delays_and_exchange_without_messages(name, network):
+    """Bounds are certified, or those of the paper's observers."""
+    assert closest("certified", name, network, episodes=4, cycles=80).min() >= 0.4
 
 
 @pytest.mark.parametrize("uniform", [True, False])
