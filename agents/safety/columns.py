@@ -101,15 +101,15 @@ def without_bounds(env: EnvDescription) -> tuple[dict[str, np.ndarray], EnvDescr
         By agent the columns (D_i,) that are left, and the description; no columns where there were no bounds anyway.
     """
     kept, layouts = {}, {}
-    longest = max(env.layouts.values(), key=lambda layout: len(layout.slots))
-    padded = len({len(layout) for layout in env.layouts.values()}) == 1  # then slots are at the same columns for all
+    longest = max(env.layouts.values(), key=lambda layout: len(layout.slots)).names
     for agent, layout in env.layouts.items():
-        names = longest.names if padded else layout.names
+        names, padding = layout.names, f"slot{len(layout.slots)}.valid"
+        if padding in names:  # columns of padded slots are where others have theirs
+            names = (*names[: layout.index(padding)], *longest[layout.index(padding) :])
         kept[agent] = np.array([q for q, name in enumerate(names) if not _is_bound(name)], np.int64)
-        if len(kept[agent]) == len(names):
-            return {}, env
-        fields = [layout.fields[q] for q in kept[agent]]
-        layouts[agent] = ObservationLayout(agent, fields, layout.slots)
+        layouts[agent] = ObservationLayout(agent, [layout.fields[q] for q in kept[agent]], layout.slots)
+    if all(len(kept[agent]) == len(layout) for agent, layout in env.layouts.items()):
+        return {}, env
     return kept, replace(env, layouts=layouts)
 
 

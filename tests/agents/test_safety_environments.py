@@ -11,7 +11,7 @@ from agents.policies import needs_bounds
 from agents.policy import by_agent
 from agents.safety.columns import without_bounds
 from khop_env.observers import Exponential, TargetObservers
-from khop_env.physics import SingleIntegrator, Sinusoid, paper_tree
+from khop_env.physics import DriftingIntegrator, SingleIntegrator, Sinusoid, paper_tree
 from khop_env.registry import make_batched
 from khop_env.scenarios import Scenario
 from khop_env.tasks import Column, Consensus
@@ -50,10 +50,10 @@ def circle(agents=8, k=6, **changes):
 CIRCLE = circle()
 
 
-def closest(margin, name="tanh", network=BURSTS, episodes=8, cycles=120):
+def closest(margin, name="tanh", network=BURSTS, episodes=8, cycles=120, scenario=CIRCLE):
     """(E,) smallest distances of episodes over a network, at every instant."""
     estimator = None if network is None else "relay"
-    env = make_batched(Bodies(), CIRCLE, num_envs=episodes, network=network, estimator=estimator, bounds=True)
+    env = make_batched(Bodies(), scenario, num_envs=episodes, network=network, estimator=estimator, bounds=True)
     policy = shielded(name, margin)
     policy.reset(describe(env), range(episodes))
     observations, _ = env.reset(0)
@@ -87,6 +87,13 @@ def test_over_bursts_of_losses_certified_bounds_keep_apart_and_estimates_do_not(
 def test_noise_delays_and_exchange_without_messages(name, network):
     """Bounds are certified, or those of the paper's observers."""
     assert closest("certified", name, network, episodes=4, cycles=80).min() >= 0.4
+
+
+def test_a_team_of_integrators_with_and_without_a_drift():
+    """Whose states have different names."""
+    mixed = circle(models=(*(SingleIntegrator(),) * 4, *(DriftingIntegrator(input_limit=2.0),) * 4))
+    assert closest("certified", episodes=4, scenario=mixed).min() >= 0.4
+    assert (closest("none", episodes=4, scenario=mixed) < 0.4).any()
 
 
 @pytest.mark.parametrize("uniform", [True, False])
