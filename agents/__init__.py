@@ -7,8 +7,9 @@ from agents.formation import FormationLaw
 from agents.laws import LAWS, LawError, make_law
 from agents.leader_following import LeaderFollowingLaw
 from agents.lyapunov import ComparisonGain
-from agents.policies import POLICIES, make_policy
+from agents.policies import POLICIES, make_policy, shielded
 from agents.policy import EnvDescription, Policy, describe
+from agents.safety import SafetyFilter
 from agents.scripted import LawPolicy, RandomPolicy, ZeroPolicy
 from agents.set_iss import analytical_gain, injected_errors, swept_bounds
 from agents.stable_baselines import sb3_policy
@@ -30,6 +31,7 @@ __all__ = [
     "Policy",
     "RandomPolicy",
     "Row",
+    "SafetyFilter",
     "TanhConsensus",
     "Tuned",
     "VelocityLaw",
@@ -44,6 +46,7 @@ __all__ = [
     "make_policy",
     "play",
     "sb3_policy",
+    "shielded",
     "swept_bounds",
     "tune",
 ]

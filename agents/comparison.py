@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.evaluation import Episodes, chosen_scenario, play
-from agents.learning.learned import LearnedPolicy
 from agents.outcomes import summary
-from agents.policies import make_policy
+from agents.policies import make_policy, needs_bounds
 from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
@@ -159,7 +158,7 @@ def compare(
         workers: number of processes; results don't depend on it.
         ray: run on a Ray cluster instead (an existing one, or a local one).
         arguments: further arguments of the environment, e.g. {"max_cycles": 100}. A learned policy that was trained
-            with bounds in its observations always gets them.
+            with bounds in its observations, or is in a certified filter, always gets them.
         networks: names of networks, e.g. ["ideal", "lossy:loss=0.3"], in each of which everything is played; None for
             the one of `arguments` or the scenario.
         progress: called with the completed fraction.
@@ -187,7 +186,7 @@ def compare(
     # check that each policy fits before the first episode
     for spec, network in itertools.product(policies, networks or (None,)):
         policy = make_policy(spec)
-        bounds = isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
+        bounds = needs_bounds(policy)
         for mode in observe:
             env = describe(player.environment(mode, bounds, network))
             rows.append((spec, env, bounds, network))

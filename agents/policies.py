@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 from agents.laws import LAWS
 from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.navigation import GoToGoal, KeepRight
 from agents.policy import Policy
+from agents.safety import Margin, SafetyFilter
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
@@ -21,6 +22,7 @@ FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy] | type[GoToGoal]] = {
     "go_to_goal": GoToGoal,
     "keep_right": KeepRight,
 }
+SHIELD = "shield"
 POLICIES = (*LAWS, *FLOOR)
 """Names of the scripted policies."""
 
@@ -35,12 +37,23 @@ def make_policy(spec: str) -> Policy:
         make_policy("ppo:pretrained")        # shipped with the library for some environments and scenarios
         make_policy("ppo:pretrained/consensus_v0")  # the shipped policy for this environment
         make_policy("my_file.py:MyPolicy")   # your own class or object; also "my_module:MyPolicy"
+        make_policy("shield:certified:tanh") # any of these in a safety filter; also shield:none:... and shield:0.3:...
 
     Raises:
         ValueError: if a name or parameter is unknown (the message suggests the closest match), a value is invalid, or a
             file isn't a policy.
     """
     name, _, argument = spec.partition(":")
+    if name == SHIELD:
+        margin, _, inside = argument.partition(":")
+        if not inside:
+            raise ValueError(
+                f"policy {spec!r}: expected {SHIELD}:MARGIN:POLICY, where MARGIN is certified, none or a number of m"
+            )
+        try:
+            return shielded(inside, margin)
+        except ValueError as error:
+            raise ValueError(f"policy {spec!r}: {error}") from error
     if name not in (*POLICIES, *ALGORITHMS) and is_object_name(spec):
         return _user_policy(spec)
     if name in ALGORITHMS:
@@ -67,6 +80,27 @@ def make_policy(spec: str) -> Policy:
     if argument:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
     return FLOOR[name]()
+
+
+def shielded(policy: str | Policy, margin: Margin = "certified", **options: Any) -> SafetyFilter:
+    """A policy in a safety filter.
+
+    Args:
+        policy: a policy, or what `make_policy` takes.
+        margin: "certified" for the estimates' certified bounds, "none", or a number of m.
+        options: of `SafetyFilter`.
+
+    Raises:
+        ValueError: for an unknown policy, or an option out of range.
+    """
+    return SafetyFilter(make_policy(policy) if isinstance(policy, str) else policy, margin, **options)
+
+
+def needs_bounds(policy: Policy) -> bool:
+    """Whether a policy needs an environment with bounds=True: in a certified filter, or trained with bounds."""
+    if isinstance(policy, SafetyFilter):
+        return policy.needs_bounds or needs_bounds(policy.policy)
+    return isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
 
 
 def _user_policy(spec: str) -> Policy:

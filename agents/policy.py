@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
+from khop_env.observers import FloatArray
 from khop_env.physics import AgentModel
 from khop_env.simulation import Observe
 
@@ -31,6 +32,7 @@ class EnvDescription:
         layouts: layout of each agent's observation, by id.
         action_sizes: number of entries of each agent's action, padding included, by id.
         error_unit: unit of the task error.
+        disturbance: bound on |w| of each acting agent by id, (n,) in state units per second.
     """
 
     environment: str
@@ -41,6 +43,7 @@ class EnvDescription:
     layouts: Mapping[str, ObservationLayout]
     action_sizes: Mapping[str, int]
     error_unit: str = "m"
+    disturbance: Mapping[str, FloatArray] = field(default_factory=dict)
 
     __repr__ = brief
 
@@ -82,6 +85,8 @@ def describe(env: object) -> EnvDescription:
     """The static description of an environment of any kind that `batched_of` accepts."""
     batched = batched_of(env)
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
+    disturbance = batched.simulator.disturbance
+    pushed = np.zeros(fleet.n) if disturbance is None else disturbance.attach(fleet).bound
     return EnvDescription(
         environment=batched.task.environment,
         scenario=batched.scenario,
@@ -91,6 +96,7 @@ def describe(env: object) -> EnvDescription:
         layouts=dict(zip(batched.agents, batched.layouts, strict=True)),
         action_sizes=dict(zip(batched.agents, sizes.tolist(), strict=True)),
         error_unit=batched.task.error_unit(batched.world),
+        disturbance={agent: pushed[fleet.state_slice(fleet.agent(agent))] for agent in batched.agents},
     )
 
 

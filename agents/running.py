@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
-from agents.policies import make_policy
+from agents.policies import make_policy, needs_bounds
 from agents.policy import Policy, describe, policy_seeds
+from agents.safety import SafetyFilter
 from khop_env.env import KHopEnv, Settings
 from khop_env.objects import described
 from khop_env.observers import Extremes, FunnelError, SolveError
@@ -129,6 +130,8 @@ def policy_run(
     about = _training(policy, named, scenario)
     if about.get("environment") == named:
         chosen = {"bounds": about["bounds"], **about.get("arguments", {}), **chosen}
+    if needs_bounds(policy):
+        chosen = {**chosen, "bounds": (arguments or {}).get("bounds", True)}
     if duration is not None:
         if "max_cycles" in (arguments or {}):
             raise ValueError("a duration and max_cycles: choose one of them for the length of the episode")
@@ -164,7 +167,9 @@ def environment_for(spec: str, scenario: Scenario) -> str:
 
 
 def _training(policy: Policy, environment: str | None, scenario: Scenario) -> Mapping[str, Any]:
-    """How a learned policy was trained; nothing of others."""
+    """How a learned policy was trained, in a safety filter or not; nothing of others."""
+    if isinstance(policy, SafetyFilter):
+        return _training(policy.policy, environment, scenario)
     if isinstance(policy, PretrainedPolicy):
         policy.environment = policy.environment or environment
         return policy.about_for(scenario.name)

@@ -25,6 +25,7 @@ from benchmarks.comparison import left_out
 from benchmarks.environments import environment_rows
 from benchmarks.networks import network_rows, violation_rows
 from benchmarks.report import Report, reason
+from benchmarks.safety import collision_rows, speed_rows
 from benchmarks.training import training_rows
 from benchmarks.yardsticks import CompiledPaper, bare_loop
 from khop_env.extras import how_to_install
@@ -92,6 +93,8 @@ def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path
         Part("environments", partial(environment_rows, report, quick, say, peers)),
         Part("environments over a network, against continuous exchange", partial(network_rows, report, quick)),
         Part("errors against certified bounds", partial(violation_rows, report, quick)),
+        Part("the safety filter", partial(speed_rows, report, quick)),
+        Part("collisions under the safety filter", partial(collision_rows, report, quick)),
         Part(
             "training: PPO, 64 environments of 8 agents",
             partial(training_rows, report, quick, peers),

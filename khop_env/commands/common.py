@@ -78,6 +78,15 @@ EstimatorOption = Annotated[
         "a class of your own, my_file.py:MyEstimator.",
     ),
 ]
+ShieldOption = Annotated[
+    str | None,
+    typer.Option(
+        "--shield",
+        metavar="MARGIN",
+        help="Play every policy in a safety filter that keeps agents apart: certified (by the certified bounds of "
+        "estimates), none (by the estimates alone), or by a margin of so many metres.",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
@@ -123,6 +132,24 @@ def load(name: str) -> Scenario:
         key = "law" if error.parameter is None else f"law.{error.parameter}"
         raise ValueError(f"{name}: {key}: {error}") from error
     return found
+
+
+def shielded_name(policy: str, shield: str | None) -> str:
+    """A policy's name in a safety filter, as `agents.make_policy` reads it; unchanged without `--shield`.
+
+    Raises:
+        ValueError: for an unknown margin.
+    """
+    if shield is None:
+        return policy
+    from agents.policies import SHIELD
+    from agents.safety import as_margin
+
+    try:
+        as_margin(shield)
+    except ValueError as error:
+        raise ValueError(f"--shield: {error}") from None
+    return f"{SHIELD}:{shield}:{policy}"
 
 
 def networked(scenario: Scenario, network: str | None, estimator: str | None) -> Networked | None:

@@ -89,11 +89,11 @@ def is_policy(controller: str | None) -> bool:
     if controller is None or name in LAWS:
         return False
     from agents.learning import ALGORITHMS
-    from agents.policies import POLICIES
+    from agents.policies import POLICIES, SHIELD
     from khop_env.objects import is_object_name
     from khop_env.physics import did_you_mean
 
-    if name not in (*POLICIES, *ALGORITHMS) and not is_object_name(controller):
+    if name not in (SHIELD, *POLICIES, *ALGORITHMS) and not is_object_name(controller):
         raise ValueError(f"no law or policy {name!r}; {did_you_mean(name, (*POLICIES, *ALGORITHMS))}")
     return True
 
@@ -149,6 +149,7 @@ def played_episode(
 ) -> Episode:
     """A policy in an environment."""
     from agents.running import environment_for, policy_run
+    from agents.safety import SafetyFilter
     from khop_env.registry import find_task
     from khop_env.scenarios.scenario import number_of_steps
     from khop_env.typed import environment_arguments
@@ -166,6 +167,8 @@ def played_episode(
     if task is None:
         say(f"khop: {spec} acts in {batched.task.environment} (khop run ENV --scenario {name} chooses another one)")
     policy = played.policy
+    if isinstance(policy, SafetyFilter):  # its options are in its name
+        policy = policy.policy
     made_of = getattr(policy, "networks", None), getattr(policy, "parameters", None)
     content = digest(spec, made_of, sources([policy, batched.task]))
     return Episode(played, played, played.observers, spec, played.duration, batched.settings.control_period, content)

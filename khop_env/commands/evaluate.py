@@ -14,10 +14,12 @@ from khop_env.commands.common import (
     EnvOption,
     EstimatorOption,
     JsonOption,
+    ShieldOption,
     load,
     mistakes,
     print_json,
     require_figure,
+    shielded_name,
     with_network,
 )
 from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
@@ -34,8 +36,9 @@ def evaluate(
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
-            "go_to_goal and keep_right in navigation_v0; classes of your own, my_file.py:MyPolicy. By default tanh, "
-            "linear, zero and random, or go_to_goal, zero and random."
+            "go_to_goal and keep_right in navigation_v0; classes of your own, my_file.py:MyPolicy; any of them in a "
+            "safety filter, shield:certified:tanh. By default tanh, linear, zero and random, or go_to_goal, zero and "
+            "random."
         ),
     ] = None,
     observe: Annotated[
@@ -50,6 +53,7 @@ def evaluate(
         ),
     ] = None,
     estimator: EstimatorOption = None,
+    shield: ShieldOption = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each row, the same for all.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
     env: EnvOption = None,
@@ -85,7 +89,10 @@ def evaluate(
             try:
                 comparison = compare(
                     environment,
-                    split_specs(policies or default, "--policies", "policy"),
+                    [
+                        shielded_name(policy, shield)
+                        for policy in split_specs(policies or default, "--policies", "policy")
+                    ],
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
                     scenario=chosen,
                     arguments=arguments,

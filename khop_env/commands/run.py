@@ -13,9 +13,11 @@ from khop_env.commands.common import (
     JsonOption,
     NetworkOption,
     ObserveOption,
+    ShieldOption,
     mistakes,
     networked,
     print_json,
+    shielded_name,
 )
 from khop_env.commands.episodes import (
     EXPLICIT_STEP,
@@ -77,6 +79,7 @@ def run(
     ] = None,
     network: NetworkOption = None,
     estimator: EstimatorOption = None,
+    shield: ShieldOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the initial state and the disturbance.")] = 0,
     env: EnvOption = None,
     out: Annotated[
@@ -108,6 +111,8 @@ def run(
 
     with mistakes(scenario or name), waiting(f"designing the observers of {name}"):
         task, chosen = resolved(name, scenario)
+        if shield is not None:
+            controller = shielded_name(controller or chosen.law.name, shield)
         steps = {"--dt": dt, "--order": order, "--integrator": integrator if integrator != "proximal" else None}
         if task is not None or is_policy(controller):
             for option, value in steps.items():

@@ -66,7 +66,8 @@ def test_every_promised_figure_is_printed():
         "ppso_memory",
         "error_to_certified_bound",
     } <= set(rows)
-    assert rows.pop("violations") == 0
+    assert rows.pop("violations") == rows.pop("collisions_certified") == 0
+    assert {f"filter_{place}_{how}" for place in ("apart", "crowd") for how in ("single", "batch")} <= set(rows)
     assert PARTS | RATES | {"environment_control_period", "environment_substeps"} <= set(rows)
     assert (rows["environment_control_period"], rows["environment_substeps"]) == (0.05, 1)
     assert all(np.isfinite(value) and value > 0 for value in rows.values())
@@ -141,6 +142,8 @@ def quick_parts(monkeypatch):
     monkeypatch.setattr(module, "environment_rows", lambda report, *rest: report.add("row 2", np.inf))
     monkeypatch.setattr(module, "network_rows", lambda report, *rest: report.add("row 3", 1.0))
     monkeypatch.setattr(module, "violation_rows", lambda report, *rest: report.add("row 4", 0.0))
+    for name in ("speed_rows", "collision_rows"):
+        monkeypatch.setattr(module, name, lambda report, *rest: None)
 
 
 class NotInstalled:

@@ -1,0 +1,6 @@
+"""A safety filter round any policy, with certified estimates (docs/theory_safety.md)."""
+
+from agents.safety.columns import Margin
+from agents.safety.filter import SafetyFilter, as_margin
+
+__all__ = ["Margin", "SafetyFilter", "as_margin"]

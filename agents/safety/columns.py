@@ -1,0 +1,203 @@
+"""Tables of the columns that a safety filter reads, and checks of what its theorem assumes.
+
+docs/theory_safety.md has the theorem, and where each margin comes from.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from agents.policy import EnvDescription
+from agents.safety.moves import Columns
+from khop_env.env import ObservationLayout
+from khop_env.observers import FloatArray, IntArray
+from khop_env.physics import AgentModel, DriftingIntegrator, SingleIntegrator
+
+Margin = str | float
+"""Half width of the box round an estimate: "certified" for its certified bounds, "none" for 0, or a number of m."""
+
+DRIFT: dict[type[AgentModel], float] = {SingleIntegrator: 0.0, DriftingIntegrator: 1.0}
+"""Agents whose velocity is their input and a drift, with the largest drift in m/s."""
+
+FLOAT32 = 2.0**-24  # relative rounding of an observation or an action
+
+
+def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> Columns:
+    """The tables of the compiled part.
+
+    Args:
+        env: the environment.
+        margin: round estimates.
+        radius: of an agent's body in m; None for what observations say.
+
+    Raises:
+        ValueError: if agents, columns or margins don't fit.
+    """
+    certified = margin == "certified"
+    constant = 0.0 if isinstance(margin, str) else margin
+    tracking: dict[str, FloatArray] = {}  # largest distance between an agent and its anchor
+    for agent, model in env.models.items():
+        _require_integrator(agent, model, env.layouts[agent])
+        tracking[agent] = _tracking(agent, env)
+    own, of_bodies, first, start = [], [], [0], 0
+    pairs: list[tuple[IntArray, FloatArray, IntArray, FloatArray, int, FloatArray, float]] = []
+    for agent, layout in env.layouts.items():
+        if certified:
+            _require_all_known(agent, layout, env)
+        place = _own(agent, env)
+        own.append((start + place, layout.high[place].astype(float), 1.01 * (tracking[agent] + _rounding(agent, env))))
+        of_bodies.append(_bodies(agent, env, start, radius))
+        for number, slot in enumerate(layout.slots):
+            name, other = f"slot{number}", tracking.get(slot.id, np.zeros(2))
+            place = layout.columns(f"{name}.position")
+            bound, highest = np.full(2, -1), np.full(2, math.inf)
+            if certified:
+                bound = np.array([layout.index(f"{name}.bound.{axis}") for axis in env.models[slot.id].position])
+                bound, highest = start + bound, layout.high[bound].astype(float)
+            by_messages = f"{name}.age" in layout.names  # then boxes are right before anything has arrived, too
+            valid = -1 if certified and by_messages else start + layout.index(f"{name}.valid")
+            widen = constant + other + _rounding(agent, env)
+            apart = float(np.linalg.norm(tracking[agent]) + np.linalg.norm(other))
+            pairs.append((start + place, layout.high[place].astype(float), bound, highest, valid, widen, apart))
+        first.append(len(pairs))
+        start += len(layout)
+    if not pairs:
+        raise ValueError(f"{env.environment} on {env.scenario} has no slots: nobody knows of anybody")
+    columns, limits, tracked = map(np.array, zip(*own, strict=True))
+    radius_column, obstacle = map(np.array, zip(*of_bodies, strict=True))
+    position, position_limit, bounds, bound_limit, valid_column, widened, distances = map(
+        np.array, zip(*pairs, strict=True)
+    )
+    speed = np.array([env.models[agent].input_limit for agent in env.agents], float)
+    return Columns(
+        columns,
+        limits,
+        np.array(first),
+        position,
+        position_limit,
+        bounds,
+        bound_limit,
+        valid_column,
+        certified,
+        widened,
+        radius_column,
+        math.nan if radius is None else radius,
+        distances,
+        obstacle,
+        np.array([_rounding(agent, env) for agent in env.agents]),
+        np.array([np.linalg.norm(tracking[agent]) for agent in env.agents]),
+        speed,
+        tracked,
+    )
+
+
+def without_bounds(env: EnvDescription) -> tuple[dict[str, np.ndarray], EnvDescription]:
+    """An environment as it is described without bounds in its observations.
+
+    Returns:
+        By agent the columns (D_i,) that are left, and the description; no columns where there were no bounds anyway.
+    """
+    kept, layouts = {}, {}
+    longest = max(env.layouts.values(), key=lambda layout: len(layout.slots)).names
+    for agent, layout in env.layouts.items():
+        names, padding = layout.names, f"slot{len(layout.slots)}.valid"
+        if padding in names:  # columns of padded slots are where others have theirs
+            names = (*names[: layout.index(padding)], *longest[layout.index(padding) :])
+        kept[agent] = np.array([q for q, name in enumerate(names) if not _is_bound(name)], np.int64)
+        layouts[agent] = ObservationLayout(agent, [layout.fields[q] for q in kept[agent]], layout.slots)
+    if all(len(kept[agent]) == len(layout) for agent, layout in env.layouts.items()):
+        return {}, env
+    return kept, replace(env, layouts=layouts)
+
+
+def _own(agent: str, env: EnvDescription) -> IntArray:
+    """(2,) columns of an agent's own position."""
+    return np.array([env.layouts[agent].index(f"own.{axis}") for axis in env.models[agent].position])
+
+
+def _bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -> tuple[int, IntArray]:
+    """The column of the bodies' radius, -1 if it is given, and (M, 2) those of obstacles' nearest points."""
+    layout = env.layouts[agent]
+    names, axes = set(layout.names), env.models[agent].position
+    column = -1
+    if radius is None:
+        if "radius" not in names:
+            raise ValueError(
+                f"observations of {env.environment} have no column 'radius', so that it isn't known how large agents "
+                "are: give SafetyFilter or shielded() radius=, in m"
+            )
+        column = start + layout.index("radius")
+    count = next(q for q in range(len(names)) if f"obstacle{q}.{axes[0]}" not in names)
+    places = [[start + layout.index(f"obstacle{q}.{axis}") for axis in axes] for q in range(count)]
+    return column, np.array(places, np.int64).reshape(-1, 2)
+
+
+def _rounding(agent: str, env: EnvDescription) -> FloatArray:
+    """(2,) largest rounding of an agent's own position in observations, in m."""
+    return FLOAT32 * env.layouts[agent].high[_own(agent, env)].astype(float)
+
+
+def _tracking(agent: str, env: EnvDescription) -> FloatArray:
+    """(2,) largest distance per axis between an agent and its anchor, in m.
+
+    Raises:
+        ValueError: if its inputs don't suffice to keep it there, or its disturbance isn't known.
+    """
+    if agent not in env.disturbance:
+        raise ValueError(f"the description says nothing of the disturbance of {agent!r}; use agents.describe(env)")
+    model, period = env.models[agent], env.control_period
+    speed, pushed = np.asarray(model.input_limit, float), np.asarray(env.disturbance[agent], float)
+    growth, drift = model.drift_growth(), DRIFT[type(model)]
+    assert growth is not None
+    reach = (speed + drift + pushed) * period + _rounding(agent, env)
+    pushed = pushed + growth.matrix @ reach  # the drift isn't what it was at the beginning of the period
+    found: FloatArray = pushed * period + _rounding(agent, env) + FLOAT32 * speed * period
+    if not (1.01 * (found + _rounding(agent, env)) + drift * period <= speed * period).all():
+        raise ValueError(
+            f"{agent!r} can't hold its place: it is pushed at up to {pushed.max() + drift:g} m/s, and its inputs are "
+            f"limited to {speed.min():g} m/s"
+        )
+    return found
+
+
+def _is_bound(name: str) -> bool:
+    slot, _, rest = name.partition(".")
+    return slot.startswith("slot") and rest.startswith("bound.")
+
+
+def _require_integrator(agent: str, model: AgentModel, layout: ObservationLayout) -> None:
+    if type(model) not in DRIFT or len(model.position) != 2:
+        raise ValueError(
+            "the safety filter is for integrators in the plane, SingleIntegrator(dim=2) and DriftingIntegrator(); "
+            f"{agent!r} is a {type(model).__name__}"
+            + (f" of dimension {model.dim}" if isinstance(model, SingleIntegrator) else "")
+        )
+    if any(name.startswith("own.input") for name in layout.names):
+        raise ValueError(
+            f"the safety filter needs inputs that are the actions: make the environment with actuator='direct'; the "
+            f"inputs of {agent!r} are states"
+        )
+
+
+def _require_all_known(agent: str, layout: ObservationLayout, env: EnvDescription) -> None:
+    """Refuse what the theorem doesn't cover."""
+    if env.observe == "local":
+        raise ValueError(
+            "margin='certified' needs observe='estimate' or 'oracle': with 'local' most agents are unknown"
+        )
+    if layout.slots and not any(_is_bound(name) for name in layout.names):
+        raise ValueError("margin='certified' reads certified bounds: make the environment with bounds=True")
+    others = {slot.id for slot in layout.slots}
+    if strangers := sorted(others - set(env.agents)):
+        raise ValueError(
+            f"margin='certified' needs everybody to run the filter, and {', '.join(strangers[:4])} doesn't act; choose "
+            "a margin of some metres, without a guarantee"
+        )
+    if unknown := [each for each in env.agents if each != agent and each not in others]:
+        raise ValueError(
+            f"margin='certified' needs everybody to know of everybody, and {agent!r} doesn't know of "
+            f"{', '.join(unknown[:4])}: they are more than k hops away; choose a scenario with a larger k"
+        )

@@ -1,0 +1,196 @@
+"""A safety filter around any policy: the inputs nearest to the policy's that keep all agents apart.
+
+docs/theory_safety.md has the theorem, its assumptions, and what is measured only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from agents.learning.learned import LearnedPolicy, PretrainedPolicy
+from agents.policy import EnvDescription, Observations, Policy
+from agents.safety.columns import Margin, read_columns, without_bounds
+from agents.safety.moves import filter_moves
+from khop_env.env.layout import Float32Array
+from khop_env.observers import FloatArray
+from khop_env.physics import SingleIntegrator
+
+
+def as_margin(margin: Margin) -> Margin:
+    """A margin from text as from code.
+
+    Raises:
+        ValueError: if it is neither a name nor a number that is 0 or more.
+    """
+    if isinstance(margin, str) and margin in ("certified", "none"):
+        return margin
+    try:
+        if not isinstance(margin, bool) and 0.0 <= float(margin) < math.inf:
+            return float(margin)
+    except (TypeError, ValueError):
+        pass
+    raise ValueError(f"margin must be 'certified', 'none' or a number of metres, 0 or more; got {margin!r}")
+
+
+class SafetyFilter:
+    """Wraps a policy and changes its inputs as little as possible, so that no two agents come closer than their bodies.
+
+        policy = SafetyFilter(make_policy("tanh"), radius=0.2)       # in an environment made with bounds=True
+        policy = shielded("tanh", margin=0.3, radius=0.2)            # a constant margin: no guarantee
+
+    It reads observations only, as a policy does, and remembers each agent's anchor: where its moves so far would have
+    brought it without a disturbance. Agents have to be integrators in the plane, with a drift or without, whose inputs
+    are their actions (actuator="direct"). With margin="certified" the distance is kept whatever the network does,
+    provided that all agents run the filter and start apart (docs/theory_safety.md); with other margins it is not.
+
+    Args:
+        policy: the policy inside; it gets the observations without bounds, unless it was trained with them.
+        margin: a `Margin`.
+        gamma: share of the gap that two agents may use up in a period together, above 0 and at most 1.
+        radius: of an agent's body in m; None for the column `radius` of observations.
+        bounds: whether the policy inside observes bounds; None for what a learned policy was trained with, and no
+            bounds for others.
+
+    Attributes:
+        policy: the policy inside.
+        needs_bounds: whether the environment must be made with bounds=True.
+        wanted: by agent (..., m), the actions of the policy inside, of the last `act`.
+        correction: by agent (..., 2), chosen less wanted input in m/s, of the last `act`.
+        intervention: by agent (...), its length.
+        infeasible: by agent (...), True where the guarantee had to be begun anew: an agent that isn't where its last
+            input should have brought it, which then starts from where it is, or that is outside of what observations
+            show, which then stops. It is never True while the theorem's assumptions hold.
+
+    Raises:
+        ValueError: for a margin, gamma or radius out of range.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        margin: Margin = "certified",
+        *,
+        gamma: float = 1.0,
+        radius: float | None = None,
+        bounds: bool | None = None,
+    ) -> None:
+        if not 0.0 < gamma <= 1.0:
+            raise ValueError(f"gamma must be above 0 and at most 1; got {gamma!r}")
+        if radius is not None and not 0.0 < radius < math.inf:
+            raise ValueError(f"radius must be a positive number of metres; got {radius!r}")
+        self.policy, self.margin, self.gamma = policy, as_margin(margin), float(gamma)
+        self.radius, self._bounds = radius, bounds
+        self.needs_bounds = self.margin == "certified"
+        self.wanted: dict[str, Float32Array] = {}
+        self.correction: dict[str, FloatArray] = {}
+        self.intervention: dict[str, FloatArray] = {}
+        self.infeasible: dict[str, np.ndarray] = {}
+
+    def __repr__(self) -> str:
+        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g})"
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Look up the columns, and reset the policy inside.
+
+        Raises:
+            ValueError: if the filter or the policy inside doesn't fit the environment; the message says why.
+        """
+        self._env = env
+        columns = read_columns(env, self.margin, self.radius)
+        self._columns: Any = tuple(columns)
+        self._speed, self._own = columns.speed, columns.own
+        models = enumerate(env.models.values())
+        self._drifting = {number: model for number, model in models if not isinstance(model, SingleIntegrator)}
+        self._anchor, self._started = np.zeros((0, 0, 2)), np.zeros((0, 0), np.bool_)
+        self._kept, inside = without_bounds(env)
+        if self._observes_bounds(env):
+            self._kept, inside = {}, env
+        self.policy.reset(inside, seeds)
+
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        """The policy's actions where they are safe, otherwise the nearest safe ones; once in a control period.
+
+        Raises:
+            ValueError: if the policy inside leaves an agent out, or the batch has changed since the reset.
+        """
+        agents, shape = self._env.agents, next(iter(observations.values())).shape[:-1]
+        seen = observations
+        if self._kept:
+            seen = {agent: np.asarray(observations[agent])[..., self._kept[agent]] for agent in observations}
+        self.wanted = self.policy.act(seen)
+        flat = np.concatenate(
+            [
+                np.asarray(observations[agent], np.float32).reshape(-1, observations[agent].shape[-1])
+                for agent in agents
+            ],
+            axis=1,
+        )
+        batch = len(flat)
+        if self._started.shape[0] != batch:
+            if self._started.size:
+                raise ValueError(f"the batch of observations changed from {len(self._started)} to {batch}: reset first")
+            self._anchor, self._started = np.zeros((batch, len(agents), 2)), np.zeros((batch, len(agents)), np.bool_)
+        fractions = np.stack([self._wanted(agent, batch) for agent in agents], axis=1)
+        speed = self._speed
+        wanted = np.clip(fractions, -1.0, 1.0, dtype=np.float64) * speed
+        chosen, infeasible = np.empty_like(wanted), np.empty((batch, len(agents)), np.bool_)
+        filter_moves(
+            self._columns,
+            flat,
+            wanted,
+            self._drift(flat),
+            self._env.control_period,
+            self.gamma,
+            self._anchor,
+            self._started,
+            chosen,
+            infeasible,
+        )
+        correction = chosen - wanted
+        change = np.linalg.norm(correction, axis=2)
+        safe = np.where((change > 0.0)[..., None], chosen / speed, fractions).astype(np.float32)
+        actions = {}
+        for number, agent in enumerate(agents):
+            action = np.array(self.wanted[agent], np.float32).reshape(batch, -1)
+            action[:, :2] = safe[:, number]
+            actions[agent] = action.reshape(*shape, -1)
+            self.correction[agent] = correction[:, number].reshape(*shape, 2)
+            self.intervention[agent] = change[:, number].reshape(shape)
+            self.infeasible[agent] = infeasible[:, number].reshape(shape)
+        return actions
+
+    def _wanted(self, agent: str, batch: int) -> Float32Array:
+        """(B, 2) what the policy inside wants of an agent."""
+        if agent not in self.wanted:
+            raise ValueError(f"the policy inside the safety filter has no action for {agent!r}")
+        wanted, expected = np.asarray(self.wanted[agent], np.float32), (batch, self._env.action_sizes[agent])
+        if wanted.size != batch * expected[1]:
+            raise ValueError(
+                f"actions of {agent!r} must have shape {expected}, one row per environment; the policy inside the "
+                f"safety filter gave {wanted.shape}"
+            )
+        return wanted.reshape(expected)[:, :2]
+
+    def _drift(self, flat: Float32Array) -> FloatArray:
+        """(B, N, 2) velocities of agents without an input."""
+        places = flat[:, self._own].astype(float)
+        drift = np.zeros_like(places)
+        for number, model in self._drifting.items():
+            drift[:, number] = model.drift(np.zeros(len(flat)), places[:, number])
+        return drift
+
+    # -- the environment -----------------------------------------------------------------------------------------
+
+    def _observes_bounds(self, env: EnvDescription) -> bool:
+        """Whether the policy inside gets the bounds, too."""
+        if self._bounds is not None:
+            return self._bounds
+        policy = self.policy
+        if isinstance(policy, PretrainedPolicy):
+            policy.environment = policy.environment or env.environment
+            return bool(policy.about_for(env.scenario).get("bounds"))
+        return isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))

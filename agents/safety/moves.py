@@ -1,0 +1,175 @@
+"""Compiled loop of the safety filter over environments, agents and slots.
+
+docs/theory_safety.md has the program. Lengths are in m, moves are of one control period.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.safety.rows import MOST_ROWS, TOLERANCE, box_rows, nearest_move, obstacle_rows
+from khop_env.compiled import compiled
+from khop_env.env.layout import Float32Array
+from khop_env.observers import FloatArray, IntArray
+
+SLACK = 1e-6  # m: added to distances for that, and for rounding, of more periods than an episode has
+EPSILON = 2.0**-23  # twice the relative rounding of a float32
+ROUNDED = 1.0 + EPSILON
+
+
+class Columns(NamedTuple):
+    """Where the filter reads, per agent (N) and per pair (P) of an agent and one of its slots, pairs sorted by agent.
+
+    Attributes:
+        own: (N, 2) columns of the agent's position.
+        own_limit: (N, 2) positions from here on may have been clipped.
+        first: (N + 1,) the agent's first pair.
+        position: (P, 2) columns of the relative position.
+        position_limit: (P, 2) as `own_limit`.
+        bound: (P, 2) columns of its bounds; -1 where it is exact or taken as such.
+        bound_limit: (P, 2) as `own_limit`.
+        valid: (P,) column of the flag that something is known; -1 where the bound says all.
+        unknown_stops: whether an agent of which nothing is known stops this one, instead of being left out.
+        widen: (P, 2) half widths that are added to each bound.
+        radius: (N,) column of the radius of the agents' bodies; -1 where it is `body`.
+        body: radius in m.
+        apart: (P,) distance that the anchors have to keep, less two radii.
+        obstacle: (N, M, 2) columns of the vectors to the nearest points of static convex obstacles.
+        rounding: (N, 2) of observed positions.
+        off: (N,) largest distance from the anchor by the theory.
+        speed: (N, 2) input limits in m/s.
+        tracking: (N, 2) largest observed distance from the anchor by the theory, per axis.
+    """
+
+    own: IntArray
+    own_limit: FloatArray
+    first: IntArray
+    position: IntArray
+    position_limit: FloatArray
+    bound: IntArray
+    bound_limit: FloatArray
+    valid: IntArray
+    unknown_stops: bool
+    widen: FloatArray
+    radius: IntArray
+    body: float
+    apart: FloatArray
+    obstacle: IntArray
+    rounding: FloatArray
+    off: FloatArray
+    speed: FloatArray
+    tracking: FloatArray
+
+
+@compiled
+def filter_moves(
+    columns: Any,
+    observations: Float32Array,
+    wanted: FloatArray,
+    drift: FloatArray,
+    period: float,
+    gamma: float,
+    anchor: FloatArray,
+    started: NDArray[np.bool_],
+    chosen: FloatArray,
+    infeasible: NDArray[np.bool_],
+) -> None:
+    """Choose every agent's input in every environment, and move its anchor.
+
+    Args:
+        columns: the fields of `Columns` as a plain tuple.
+        observations: (B, D) of all agents, side by side.
+        wanted: (B, N, 2) wanted inputs in m/s, within the limits.
+        drift: (B, N, 2) velocity of an agent without an input, at its place, in m/s.
+        period: the control period in s.
+        gamma: share of the gap that two agents together may use up in a period.
+        anchor: (B, N, 2) moved; set where an agent has none.
+        started: (B, N) whether an agent has an anchor.
+        chosen: (B, N, 2) overwritten with the inputs; exactly `wanted` where nothing is near.
+        infeasible: (B, N) overwritten: the agent isn't where its last move should have brought it, or may be outside of
+            what observations show.
+    """
+    columns = Columns(*columns)
+    agents = columns.own.shape[0]
+    most = 0
+    for i in range(agents):
+        most = max(most, columns.first[i + 1] - columns.first[i])
+    obstacles = columns.obstacle.shape[1]
+    rows = np.empty((4 + 2 * obstacles + most * MOST_ROWS + 1, 3))
+    for b in range(observations.shape[0]):
+        for i in range(agents):
+            px, py = float(observations[b, columns.own[i, 0]]), float(observations[b, columns.own[i, 1]])
+            infeasible[b, i] = False
+            if not (abs(px) < columns.own_limit[i, 0] and abs(py) < columns.own_limit[i, 1]):
+                infeasible[b, i], started[b, i] = True, False
+                chosen[b, i, 0] = chosen[b, i, 1] = 0.0
+                continue
+            off_x, off_y = px - anchor[b, i, 0], py - anchor[b, i, 1]
+            lost = not (abs(off_x) <= columns.tracking[i, 0] and abs(off_y) <= columns.tracking[i, 1])
+            if lost or not started[b, i]:
+                infeasible[b, i] = started[b, i]
+                started[b, i] = True
+                anchor[b, i, 0], anchor[b, i, 1] = px, py
+                off_x = off_y = 0.0
+            most_x, most_y = columns.speed[i, 0] * period, columns.speed[i, 1] * period
+            to_x, to_y = off_x + drift[b, i, 0] * period, off_y + drift[b, i, 1] * period  # the anchor's without input
+            wx, wy = wanted[b, i, 0] * period + to_x, wanted[b, i, 1] * period + to_y
+            reach = math.sqrt((most_x + abs(to_x)) ** 2 + (most_y + abs(to_y)) ** 2)
+            used = 4  # the input's limits
+            for row in range(4):
+                rows[row, 0], rows[row, 1] = (0.0, 0.0)
+                rows[row, row // 2] = 1.0 if row % 2 == 0 else -1.0
+            rows[0, 2], rows[1, 2] = max(most_x + to_x, 0.0), max(most_x - to_x, 0.0)
+            rows[2, 2], rows[3, 2] = max(most_y + to_y, 0.0), max(most_y - to_y, 0.0)
+            radius = columns.body
+            if columns.radius[i] >= 0:
+                radius = ROUNDED * float(observations[b, columns.radius[i]])
+            turn = 2.0 * math.asin(min(1.0, 0.5 * columns.off[i] / radius))
+            for q in range(obstacles):
+                x = float(observations[b, columns.obstacle[i, q, 0]])
+                y = float(observations[b, columns.obstacle[i, q, 1]])
+                near = math.sqrt(x * x + y * y)
+                if near == 0.0 or turn >= 0.5 * math.pi:
+                    used = -1
+                    break
+                x, y = x / near, y / near
+                ahead = near * (1.0 - EPSILON) + x * off_x + y * off_y - columns.rounding[i, 0] - columns.rounding[i, 1]
+                used = obstacle_rows(x, y, ahead, radius + columns.off[i] + SLACK, turn, reach, rows, used)
+            for pair in range(columns.first[i], columns.first[i + 1]):
+                if used < 0:
+                    break
+                known = columns.valid[pair] < 0 or observations[b, columns.valid[pair]] > 0.5
+                if not known and not columns.unknown_stops:
+                    continue
+                x = float(observations[b, columns.position[pair, 0]])
+                y = float(observations[b, columns.position[pair, 1]])
+                hx = hy = 0.0
+                if columns.bound[pair, 0] >= 0:
+                    hx = float(observations[b, columns.bound[pair, 0]])
+                    hy = float(observations[b, columns.bound[pair, 1]])
+                    known = known and hx < columns.bound_limit[pair, 0] and hy < columns.bound_limit[pair, 1]
+                known = known and abs(x) < columns.position_limit[pair, 0] and abs(y) < columns.position_limit[pair, 1]
+                if not known:
+                    used = -1
+                    break
+                half_x = hx * ROUNDED + abs(x) * EPSILON + columns.widen[pair, 0]
+                half_y = hy * ROUNDED + abs(y) * EPSILON + columns.widen[pair, 1]
+                distance = 2.0 * radius + columns.apart[pair] + SLACK
+                used = box_rows(x + off_x, y + off_y, half_x, half_y, distance, gamma, reach, rows, used)
+            broken = used < 0
+            for m in range(4, used):
+                broken = broken or rows[m, 0] * wx + rows[m, 1] * wy > rows[m, 2] + TOLERANCE
+            if broken:
+                zx = zy = 0.0
+                if used > 0:
+                    zx, zy = nearest_move(rows, used, wx, wy)
+                chosen[b, i, 0], chosen[b, i, 1] = (zx - to_x) / period, (zy - to_y) / period
+            else:
+                zx, zy = wx, wy
+                chosen[b, i, 0], chosen[b, i, 1] = wanted[b, i, 0], wanted[b, i, 1]
+            anchor[b, i, 0] += zx
+            anchor[b, i, 1] += zy
