@@ -22,7 +22,9 @@ def test_evaluate_prints_json():
         *("--observe", "estimate,local", "--episodes", "3", "--json"),
     )
     found = json.loads(result.stdout)
-    assert list(found) == ["environment", "scenario", "episodes", "task_error_unit", "rows"]
+    assert list(found) == [
+        *("environment", "scenario", "episodes", "network", "estimator", "task_error_unit", "rows"),
+    ]
     assert (found["environment"], found["scenario"], found["episodes"]) == ("leader_following_v0", "paper", 3)
     keys = ["policy", "observe", "mean_return", "ci95", "final_task_error", "settling_time", "effort"]
     keys += ["max_normalized_disagreement", "max_error_to_bound"]

@@ -225,9 +225,9 @@ class TestRun:
         labels = []
         draw = Panel.draw
 
-        def drawn(self, canvas, t, normalized, task_error, hidden):
-            labels.append((self._error_label, self._error_unit, task_error))
-            draw(self, canvas, t, normalized, task_error, hidden)
+        def drawn(self, canvas, scene, *others):
+            labels.append((self._error_label, self._error_unit, scene.task_error))
+            draw(self, canvas, scene, *others)
 
         monkeypatch.setattr(Panel, "draw", drawn)
         options = ("--controller", "zero", "--duration", "0.2", "--video", "film.gif", "--json")

@@ -112,7 +112,8 @@ def run(
     with mistakes(scenario or name), waiting(f"designing the observers of {name}"):
         task, chosen = resolved(name, scenario)
         if shield is not None:
-            controller = shielded_name(controller or chosen.law.name, shield)
+            inside = controller or (None if task is None else task.default_policy) or chosen.law.name
+            controller = shielded_name(inside, shield)
         steps = {"--dt": dt, "--order": order, "--integrator": integrator if integrator != "proximal" else None}
         if task is not None or is_policy(controller):
             for option, value in steps.items():
