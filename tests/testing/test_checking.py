@@ -75,7 +75,7 @@ def test_noise_is_found_although_buffers_are_written_again():
         def observe_all(self):
             seen = super().observe_all()
             if self.t == 1:
-                seen["walker_0"] += np.random.default_rng().uniform(0.0, 1e-6, 2).astype(np.float32)
+                seen["walker_0"] += np.random.default_rng().uniform(0.0, 1e-3, 2).astype(np.float32)
             return seen
 
     report = check_environment(NoisyStart, steps=HORIZON)  # the last observation has no noise
