@@ -58,7 +58,7 @@ class TestList:
 
     def test_json(self):
         found = only_json(khop("list", "--json"))
-        assert [one["name"] for one in found["scenarios"]] == list(SCENARIOS)
+        assert [each["name"] for each in found["scenarios"]] == list(SCENARIOS)
         assert found["environments"] == list(ENVIRONMENTS)
 
 

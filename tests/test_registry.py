@@ -40,7 +40,7 @@ def test_every_scenario_is_complete(name):
 def test_descriptions():
     assert [one["name"] for one in describe()] == list(scenarios())
     assert all(one["description"] for one in describe())
-    by_name = {one["name"]: one["parameters"] for one in describe()}
+    by_name = {each["name"]: each["parameters"] for each in describe()}
     assert by_name["random_geometric"] == {"agents": 100, "k": 2, "seed": 0, "rate": 5.0}
 
 

@@ -186,7 +186,7 @@ def fields(cls):
 )
 def test_typed_dictionaries_equal_the_dataclasses(arguments, cls):
     several = cls if isinstance(cls, tuple) else (cls,)
-    assert typed(arguments) == {name: hint for one in several for name, hint in fields(one).items()}
+    assert typed(arguments) == {name: hint for each in several for name, hint in fields(each).items()}
 
 
 @pytest.mark.parametrize("module", [consensus_v0, formation_v0, leader_following_v0, navigation_v0])

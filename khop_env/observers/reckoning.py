@@ -48,14 +48,14 @@ class Reckoning:
 
     def __init__(self, layout: PairLayout, certificates: Sequence[Certificate], num_envs: int) -> None:
         self._num_envs, self._layout = num_envs, layout
-        growths = [certificates[i].growth for i in layout.target.tolist()]
-        self.longest_step = min((certificates[i].longest_step for i in layout.target.tolist()), default=math.inf)
+        of_targets = [certificates[i] for i in layout.target.tolist()]
+        self.longest_step = min((each.longest_step for each in of_targets), default=math.inf)
         self._runs: list[_Run] = []
         last: tuple[AgentModel, bytes] | None = None
         matrices: list[FloatArray] = []
-        for block, growth in zip(layout.blocks, growths, strict=True):
-            certificate, n = certificates[block.agent], block.components
-            model, region = certificate.model, certificate.region.tobytes()
+        for block, certificate in zip(layout.blocks, of_targets, strict=True):
+            model, growth, n = certificate.model, certificate.growth, block.components
+            region = certificate.region.tobytes()
             matrices.append(np.zeros((n, n)) if growth is None else growth.matrix)
             if growth is not None and not growth.matrix.any() and not growth.spread.any():
                 continue
@@ -65,7 +65,6 @@ class Reckoning:
                 columns, pairs = slice(first.columns.start, columns.stop), slice(first.pairs.start, pairs.stop)
             self._runs.append(_Run(extended_drift(model, growth), columns, pairs, n))
             last = model, region
-        each = [certificates[i] for i in layout.target.tolist()]
         nothing = [np.zeros(0)]
         arrays = layout.arrays
         self._arrays: Any = (
@@ -76,8 +75,12 @@ class Reckoning:
             arrays.row,
             np.cumsum([0, *(m.size for m in matrices)])[:-1],
             np.concatenate([*nothing, *(m.ravel() for m in matrices)]),
-            np.concatenate([*nothing, *(np.zeros(c.model.n) if c.growth is None else c.growth.spread for c in each)]),
-            np.concatenate([*nothing, *(np.full(c.model.n, math.inf) if c.growth is None else c.rate for c in each)]),
+            np.concatenate(
+                [*nothing, *(np.zeros(c.model.n) if c.growth is None else c.growth.spread for c in of_targets)]
+            ),
+            np.concatenate(
+                [*nothing, *(np.full(c.model.n, math.inf) if c.growth is None else c.rate for c in of_targets)]
+            ),
         )
         self._rate = np.zeros((layout.size, num_envs))
         self._length = np.zeros((layout.pairs, num_envs))
@@ -117,7 +120,7 @@ class Reckoning:
 
 @compiled
 def move(arrays: Any, length: FloatArray, rate: FloatArray, p: FloatArray, r: FloatArray) -> None:
-    """P += h rate, and the certified errors r likewise; `length` (pairs, B) is h, of 0 where nothing moves."""
+    """Move predictions, p += h rate, and certified errors r; `length` (pairs, B) is h, of 0 where nothing moves."""
     observers, components, columns, pairs, rows, starts, matrix, spread, pushed = arrays
     batch = p.shape[1]
     most = 1

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-
 import numpy as np
 
 from khop_env.scenarios.scenario import Scenario
@@ -66,7 +64,7 @@ def corridor(
     ]
     arena = Arena(radius, apart=scale, goals="opposite", obstacles=(*walls, *discs))
     return team(
-        named("corridor", chosen, {key: each.default for key, each in inspect.signature(corridor).parameters.items()}),
+        named(corridor, chosen),
         f"{agents} agents change sides through a corridor with obstacles: for navigation",
         center,
         half_width,

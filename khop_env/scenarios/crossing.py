@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 
 import numpy as np
@@ -55,7 +54,7 @@ def crossing(
     half_width = np.full((agents, 2), 0.8 * math.sqrt(agents) * scale)
     arena = Arena(radius, apart=scale, goals="random")
     return team(
-        named("crossing", chosen, {key: each.default for key, each in inspect.signature(crossing).parameters.items()}),
+        named(crossing, chosen),
         f"{agents} agents in a square go to random goals: for navigation",
         center,
         half_width,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 
 import numpy as np
@@ -56,7 +55,7 @@ def swap(
     half_width = np.full((agents, 2), 0.1 * scale)
     arena = Arena(radius, apart=2.5 * radius, goals="opposite")
     return team(
-        named("swap", chosen, {key: each.default for key, each in inspect.signature(swap).parameters.items()}),
+        named(swap, chosen),
         f"{agents} agents on a circle go to the opposite side: for navigation",
         center,
         half_width,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 
@@ -100,10 +101,11 @@ def team(
     ).sized()
 
 
-def named(family: str, parameters: dict[str, object], defaults: dict[str, object]) -> str:
+def named(family: Callable[..., Scenario], parameters: dict[str, object]) -> str:
     """The family's name, with the parameters that differ from its defaults, as `scenario` reads it."""
+    defaults = {key: each.default for key, each in inspect.signature(family).parameters.items()}
     changed = ",".join(f"{key}={_text(value)}" for key, value in parameters.items() if value != defaults[key])
-    return f"{family}:{changed}" if changed else family
+    return f"{family.__name__}:{changed}" if changed else family.__name__
 
 
 def _text(value: object) -> str:

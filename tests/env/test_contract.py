@@ -38,7 +38,7 @@ def require_in_space(env, observations, infos, rewards=None):
         assert all(type(value) in (int, float) and np.isfinite(value) for value in infos[agent].values())
         np.testing.assert_array_equal(env.observe(agent), observation)
     assert env.state_space.contains(env.state())
-    assert rewards is None or all(type(one) is float and np.isfinite(one) for one in rewards.values())
+    assert rewards is None or all(type(each) is float and np.isfinite(each) for each in rewards.values())
 
 
 @cross

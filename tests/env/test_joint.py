@@ -39,7 +39,7 @@ def test_it_is_the_parallel_environment_side_by_side(environment, name, uniform)
             assert reward == pytest.approx(np.mean(list(rewards.values())), rel=1e-12)
             assert (terminated, truncated) == (False, truncations[agents[0]])
             assert env.state().tobytes() == other.state().tobytes()
-            together = {key: [infos[one][key] for one in agents] for key in info_keys(environment)}
+            together = {key: [infos[each][key] for each in agents] for key in info_keys(environment)}
             assert info["task_error"] == pytest.approx(np.mean(together["task_error"]), rel=1e-12)
             assert info["max_error_to_bound"] == max(together["max_error_to_bound"])
             assert info["max_normalized_disagreement"] == max(together["max_normalized_disagreement"])

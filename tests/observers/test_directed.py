@@ -217,7 +217,7 @@ class TestRing:
         report = design_report(ring())
         assert report["feasible"] is True
         assert (report["edges"], report["one_way_links"], report["design_rule"]) == (6, 6, "sharp")
-        (assumption,) = [one for one in report["assumptions"] if one["number"] == "3"]
+        (assumption,) = [each for each in report["assumptions"] if each["number"] == "3"]
         assert assumption["status"] == "doesn't hold"
         assert "6 of 6 links go one way" in assumption["why"]
         assert "by construction" in assumption["why"]

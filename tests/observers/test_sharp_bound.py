@@ -127,9 +127,9 @@ def test_feasibility_and_sizes_follow_the_rule():
     wider = sharp.design.states.gain / paper.design.states.gain
     radius = paper.initial.radius
     for method, factor in (("feasible_at_start", 1.0 / wider), ("smallest_initial_bound", 1.0 / wider)):
-        found = [getattr(one.design.states, method)(radius) for one in (paper, sharp)]
+        found = [getattr(each.design.states, method)(radius) for each in (paper, sharp)]
         np.testing.assert_allclose(found[1], factor * found[0], rtol=1e-12)
-    sizes = [one.sized().delta.initial for one in (paper, sharp)]
+    sizes = [each.sized().delta.initial for each in (paper, sharp)]
     assert sizes[1] < sizes[0]
     assert sharp.sized().design.design_rule == "sharp"
     assert sharp.sized().design.states.feasible_at_start(radius).max() == pytest.approx(0.8, rel=1e-9)

@@ -73,7 +73,7 @@ def test_a_law_cannot_overwrite_the_plant(name, observers, num_envs):
     culprit = Culprit()
 
     def law(t, view):
-        culprit.touch({"t": t, **{one: getattr(view, one) for one in ("x", "edges", "known", "displacement")}}, name)
+        culprit.touch({"t": t, **{each: getattr(view, each) for each in ("x", "edges", "known", "displacement")}}, name)
         return np.zeros((num_envs, 8))
 
     refused(scenario().build(law=law, observers=observers, num_envs=num_envs), culprit)
