@@ -22,7 +22,9 @@ FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy] | type[GoToGoal]] = {
     "go_to_goal": GoToGoal,
     "keep_right": KeepRight,
 }
-SHIELD = "shield"
+FILTER = "filter"
+FILTER_OPTIONS = {"margin": str, "gamma": float, "radius": float, "bounds": bool}
+"""Options of the safety filter in a policy's name, and their types."""
 POLICIES = (*LAWS, *FLOOR)
 """Names of the scripted policies."""
 
@@ -37,23 +39,16 @@ def make_policy(spec: str) -> Policy:
         make_policy("ppo:pretrained")        # shipped with the library for some environments and scenarios
         make_policy("ppo:pretrained/consensus_v0")  # the shipped policy for this environment
         make_policy("my_file.py:MyPolicy")   # your own class or object; also "my_module:MyPolicy"
-        make_policy("shield:certified:tanh") # any of these in a safety filter; also shield:none:... and shield:0.3:...
+        make_policy("filter")                # keep_right in a safety filter, with certified bounds
+        make_policy("filter:margin=0.3,gamma=0.5:ppo:runs/first")  # any of these, with options of SafetyFilter
 
     Raises:
         ValueError: if a name or parameter is unknown (the message suggests the closest match), a value is invalid, or a
             file isn't a policy.
     """
     name, _, argument = spec.partition(":")
-    if name == SHIELD:
-        margin, _, inside = argument.partition(":")
-        if not inside:
-            raise ValueError(
-                f"policy {spec!r}: expected {SHIELD}:MARGIN:POLICY, where MARGIN is certified, none or a number of m"
-            )
-        try:
-            return shielded(inside, margin)
-        except ValueError as error:
-            raise ValueError(f"policy {spec!r}: {error}") from error
+    if name == FILTER:
+        return _filter(spec, argument)
     if name not in (*POLICIES, *ALGORITHMS) and is_object_name(spec):
         return _user_policy(spec)
     if name in ALGORITHMS:
@@ -76,7 +71,7 @@ def make_policy(spec: str) -> Policy:
         parameters = parameters_from_text(argument, get_type_hints(LAWS[name]), f"policy {spec!r}")
         return LawPolicy(name, parameters)
     if name not in POLICIES:
-        raise ValueError(f"no policy {name!r}; {did_you_mean(name, (*POLICIES, *ALGORITHMS))}")
+        raise ValueError(f"no policy {name!r}; {did_you_mean(name, (*POLICIES, FILTER, *ALGORITHMS))}")
     if argument:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
     return FLOOR[name]()
@@ -101,6 +96,23 @@ def needs_bounds(policy: Policy) -> bool:
     if isinstance(policy, SafetyFilter):
         return policy.needs_bounds or needs_bounds(policy.policy)
     return isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
+
+
+def _filter(spec: str, argument: str) -> SafetyFilter:
+    """The safety filter of "filter[:OPTION=VALUE,...][:POLICY]"."""
+    options, colon, inside = argument.partition(":")
+    if "=" not in options:
+        options, inside = "", argument
+    found = parameters_from_text(options, FILTER_OPTIONS, f"policy {spec!r}")
+    for key in found:
+        if key not in FILTER_OPTIONS:
+            raise ValueError(f"policy {spec!r}: no option {key!r}; {did_you_mean(key, FILTER_OPTIONS)}")
+    if colon and not inside:
+        raise ValueError(f"policy {spec!r}: expected {FILTER}:OPTION=VALUE,...:POLICY; there is no policy")
+    try:
+        return shielded(inside or "keep_right", **found)
+    except ValueError as error:
+        raise ValueError(f"policy {spec!r}: {error}") from error
 
 
 def _user_policy(spec: str) -> Policy:

@@ -9,7 +9,7 @@ EPISODES = 10
 
 comparison = compare(
     "navigation_v0",
-    ["keep_right", "shield:none:keep_right", "shield:certified:keep_right"],
+    ["keep_right", "filter:margin=none", "filter"],
     ["estimate"],
     scenario="swap:agents=6,duration=20",
     seeds=range(EPISODES),

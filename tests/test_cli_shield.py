@@ -54,7 +54,7 @@ def test_bounds_are_switched_on_for_the_filter_that_needs_them(folder):
     """And the controller's name says which filter it was in."""
     options = "--controller", "linear:gain=0.5", "--duration", "4", "--json"
     found = only_json(khop("run", *PLAYED, *options, "--shield", "certified"))
-    assert found["controller"] == "shield:certified:linear:gain=0.5"
+    assert found["controller"] == "filter:linear:gain=0.5"
     assert found["configuration"]["settings"]["bounds"] is True
     plain = only_json(khop("run", *PLAYED, *options))
     assert plain["configuration"]["settings"]["bounds"] is False
@@ -65,9 +65,11 @@ def test_every_policy_of_an_evaluation_is_shielded(folder):
     """By the option, or one by one by name."""
     options = "--episodes", "2", "--observe", "estimate", "--env", "max_cycles=20", "--json"
     found = only_json(khop("evaluate", *PLAYED, "--policies", "linear:gain=1,zero", "--shield", "0.1", *options))
-    assert [row["policy"] for row in found["rows"]] == ["shield:0.1:linear:gain=1", "shield:0.1:zero"]
-    found = only_json(khop("evaluate", *PLAYED, "--policies", "zero,shield:none:linear:gain=1", *options))
-    assert [row["policy"] for row in found["rows"]] == ["zero", "shield:none:linear:gain=1"]
+    assert [row["policy"] for row in found["rows"]] == ["filter:margin=0.1:linear:gain=1", "filter:margin=0.1:zero"]
+    found = only_json(
+        khop("evaluate", *PLAYED, "--policies", "zero,filter:margin=none,gamma=0.5:linear:gain=1", *options)
+    )
+    assert [row["policy"] for row in found["rows"]] == ["zero", "filter:margin=none,gamma=0.5:linear:gain=1"]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +81,7 @@ def test_every_policy_of_an_evaluation_is_shielded(folder):
             "observations of consensus_v0 have no column 'radius'",
         ),
         (("run", "mixed_fleet", "--shield", "none"), "the safety filter is for integrators in the plane"),
-        (("evaluate", *PLAYED, "--policies", "shield:none"), "expected shield:MARGIN:POLICY"),
+        (("evaluate", *PLAYED, "--policies", "filter:margin=none:"), "expected filter:OPTION=VALUE,...:POLICY"),
         (("run", *PLAYED, "--shield", "certified", "--env", "bounds=false"), "with bounds=True"),
     ],
 )

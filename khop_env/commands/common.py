@@ -84,7 +84,7 @@ ShieldOption = Annotated[
         "--shield",
         metavar="MARGIN",
         help="Play every policy in a safety filter that keeps agents apart: certified (by the certified bounds of "
-        "estimates), none (by the estimates alone), or by a margin of so many metres.",
+        "estimates), none (by the estimates alone), or by a margin of so many metres; options follow: certified,gamma=0.5.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -142,14 +142,15 @@ def shielded_name(policy: str, shield: str | None) -> str:
     """
     if shield is None:
         return policy
-    from agents.policies import SHIELD
+    from agents.policies import FILTER
     from agents.safety import as_margin
 
+    margin, comma, options = shield.partition(",")
     try:
-        as_margin(shield)
+        as_margin(margin)
     except ValueError as error:
         raise ValueError(f"--shield: {error}") from None
-    return f"{SHIELD}:{shield}:{policy}"
+    return f"{FILTER}:{policy}" if shield == "certified" else f"{FILTER}:margin={margin}{comma}{options}:{policy}"
 
 
 def networked(scenario: Scenario, network: str | None, estimator: str | None) -> Networked | None:

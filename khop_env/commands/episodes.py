@@ -89,12 +89,12 @@ def is_policy(controller: str | None) -> bool:
     if controller is None or name in LAWS:
         return False
     from agents.learning import ALGORITHMS
-    from agents.policies import POLICIES, SHIELD
+    from agents.policies import FILTER, POLICIES
     from khop_env.objects import is_object_name
     from khop_env.physics import did_you_mean
 
-    if name not in (SHIELD, *POLICIES, *ALGORITHMS) and not is_object_name(controller):
-        raise ValueError(f"no law or policy {name!r}; {did_you_mean(name, (*POLICIES, *ALGORITHMS))}")
+    if name not in (FILTER, *POLICIES, *ALGORITHMS) and not is_object_name(controller):
+        raise ValueError(f"no law or policy {name!r}; {did_you_mean(name, (*POLICIES, FILTER, *ALGORITHMS))}")
     return True
 
 

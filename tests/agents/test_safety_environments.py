@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from agents import compare, describe, make_policy, shielded
+from agents.navigation import KeepRight
 from agents.policies import needs_bounds
 from agents.policy import by_agent
 from agents.safety.columns import without_bounds
@@ -192,15 +193,22 @@ def test_options_out_of_range_are_refused():
 
 
 def test_policies_by_name():
-    """shield:MARGIN:POLICY, whose policy has parameters of its own."""
-    policy = make_policy("shield:certified:linear:gain=2,cancel_drift=true")
+    """filter:OPTION=VALUE,...:POLICY, whose policy has parameters of its own."""
+    policy = make_policy("filter:linear:gain=2,cancel_drift=true")
     assert (policy.margin, policy.policy.parameters) == ("certified", {"gain": 2.0, "cancel_drift": True})
-    assert make_policy("shield:0.3:zero").margin == 0.3
-    assert [needs_bounds(make_policy(f"shield:{margin}:zero")) for margin in ("certified", "none")] == [True, False]
+    assert make_policy("filter:margin=0.3,gamma=0.5:zero").margin == 0.3
+    assert isinstance(make_policy("filter").policy, KeepRight)
+    assert [needs_bounds(make_policy(f"filter:margin={margin}:zero")) for margin in ("certified", "none")] == [
+        True,
+        False,
+    ]
     for spec, message in (
-        ("shield:certified", "expected shield:MARGIN:POLICY"),
-        ("shield:tanh:zero", "margin must be .* got 'tanh'"),
-        ("shield:none:tan", "did you mean 'tanh'"),
+        ("filter:margin=none:", "there is no policy"),
+        ("filter:margin=tanh:zero", "margin must be .* got 'tanh'"),
+        ("filter:margn=none", "no option 'margn'; did you mean 'margin'"),
+        ("filter:gamma=x", "gamma must be of type float; got 'x'"),
+        ("filter:gamma=2", "gamma must be above 0 and at most 1"),
+        ("filter:tan", "did you mean 'tanh'"),
     ):
         with pytest.raises(ValueError, match=message):
             make_policy(spec)
@@ -210,7 +218,7 @@ def test_comparisons_switch_bounds_on():
     """For the rows that need them."""
     compared = compare(
         Bodies(),
-        ["tanh", "shield:none:tanh", "shield:certified:tanh"],
+        ["tanh", "filter:margin=none:tanh", "filter:tanh"],
         scenario=CIRCLE,
         seeds=range(2),
         arguments={"network": BURSTS, "max_cycles": 10},
