@@ -84,7 +84,7 @@ ShieldOption = Annotated[
         "--shield",
         metavar="MARGIN",
         help="Play every policy in a safety filter that keeps agents apart: certified (by the certified bounds of "
-        "estimates), none (by the estimates alone), or by a margin of so many metres; options follow: certified,gamma=0.5.",
+        "estimates), none (by the estimates alone), or by a margin of so many metres; also certified,gamma=0.5.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
