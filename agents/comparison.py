@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.evaluation import Episodes, chosen_scenario, play
 from agents.outcomes import summary
-from agents.policies import make_policy, needs_bounds
+from agents.policies import Needs, make_policy, needs
 from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 CHUNK = 25  # episodes per batch; fixed, so that results don't depend on the number of workers
 
-_Task = tuple[str, Observe, bool, str | None, tuple[int, ...]]  # policy, observation mode, with bounds, network, seeds
+_Task = tuple[str, Observe, Needs, str | None, tuple[int, ...]]  # policy, observation mode, its needs, network, seeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,14 +182,14 @@ def compare(
     if networks is not None and (not networks or "network" in (arguments or {})):
         raise ValueError(f"networks must be names, and arguments without a network then; got networks={networks!r}")
     player = _Player(environment, chosen_scenario(environment, scenario), arguments or {})
-    rows: list[tuple[str, EnvDescription, bool, str | None]] = []
+    rows: list[tuple[str, EnvDescription, Needs, str | None]] = []
     # check that each policy fits before the first episode
     for spec, network in itertools.product(policies, networks or (None,)):
         policy = make_policy(spec)
-        bounds = needs_bounds(policy)
+        needed = needs(policy)
         for mode in observe:
-            env = describe(player.environment(mode, bounds, network))
-            rows.append((spec, env, bounds, network))
+            env = describe(player.environment(mode, needed, network))
+            rows.append((spec, env, needed, network))
             try:
                 policy.reset(env, [0])
             except ValueError as error:
@@ -201,7 +201,7 @@ def compare(
         over = (several or observers.network.described(), observers.estimator.name)
     chunks = [tuple(int(seed) for seed in seeds[first : first + CHUNK]) for first in range(0, len(seeds), CHUNK)]
     tasks: list[_Task] = [
-        (spec, env.observe, bounds, network, chunk) for spec, env, bounds, network in rows for chunk in chunks
+        (spec, env.observe, needed, network, chunk) for spec, env, needed, network in rows for chunk in chunks
     ]
     results: list[Episodes | None] = [None] * len(tasks)
 
@@ -250,20 +250,20 @@ class _Player:
 
     def __init__(self, environment: Environment, scenario: Scenario, arguments: Mapping[str, Any]) -> None:
         self._environment, self._scenario, self._arguments = environment, scenario, dict(arguments)
-        self._made: dict[tuple[Observe, bool, str | None], BatchedEnv] = {}
+        self._made: dict[tuple[Observe, Needs, str | None], BatchedEnv] = {}
 
-    def environment(self, observe: Observe, bounds: bool, network: str | None) -> BatchedEnv:
-        """The environment, with num_envs = CHUNK; with bounds in observations unless the arguments say otherwise."""
-        if (observe, bounds, network) not in self._made:
-            arguments = {"bounds": True, **self._arguments} if bounds else self._arguments
+    def environment(self, observe: Observe, needed: Needs, network: str | None) -> BatchedEnv:
+        """The environment, with num_envs = CHUNK, and what a policy needs unless the arguments say otherwise."""
+        if (observe, needed, network) not in self._made:
+            arguments = needed.among(self._arguments)
             arguments = arguments if network is None else {**arguments, "network": network}
             env = make_batched(self._environment, self._scenario, num_envs=CHUNK, observe=observe, **arguments)
-            self._made[observe, bounds, network] = env
-        return self._made[observe, bounds, network]
+            self._made[observe, needed, network] = env
+        return self._made[observe, needed, network]
 
     def __call__(self, task: _Task) -> Episodes:
-        spec, observe, bounds, network, seeds = task
-        return play(self.environment(observe, bounds, network), make_policy(spec), seeds, name=spec)
+        spec, observe, needed, network, seeds = task
+        return play(self.environment(observe, needed, network), make_policy(spec), seeds, name=spec)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_made": {}}

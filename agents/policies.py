@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, get_type_hints
+from collections.abc import Mapping
+from typing import Any, NamedTuple, get_type_hints
 
 from agents.laws import LAWS
 from agents.learning.config import ALGORITHMS
@@ -23,7 +24,7 @@ FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy] | type[GoToGoal]] = {
     "keep_right": KeepRight,
 }
 FILTER = "filter"
-FILTER_OPTIONS = {"margin": str, "gamma": float, "radius": float, "bounds": bool}
+FILTER_OPTIONS = {"margin": str, "gamma": float, "announce": bool, "radius": float, "bounds": bool}
 """Options of the safety filter in a policy's name, and their types."""
 POLICIES = (*LAWS, *FLOOR)
 """Names of the scripted policies."""
@@ -91,11 +92,29 @@ def shielded(policy: str | Policy, margin: Margin = "certified", **options: Any)
     return SafetyFilter(make_policy(policy) if isinstance(policy, str) else policy, margin, **options)
 
 
-def needs_bounds(policy: Policy) -> bool:
-    """Whether a policy needs an environment with bounds=True: in a certified filter, or trained with bounds."""
+class Needs(NamedTuple):
+    """Arguments of an environment that a policy needs.
+
+    Attributes:
+        bounds: whether bounds must be in observations.
+        message_size: numbers that it adds to messages.
+    """
+
+    bounds: bool
+    message_size: int
+
+    def among(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """These, and then `arguments`, which come first where they say otherwise."""
+        needed: dict[str, Any] = {"bounds": True} if self.bounds else {}
+        return needed | ({"message_size": self.message_size} if self.message_size else {}) | dict(arguments)
+
+
+def needs(policy: Policy) -> Needs:
+    """What a policy needs of its environment: bounds in a certified filter, or trained with them; messages."""
     if isinstance(policy, SafetyFilter):
-        return policy.needs_bounds or needs_bounds(policy.policy)
-    return isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
+        inside = needs(policy.policy)
+        return Needs(policy.needs_bounds or inside.bounds, policy.needs_messages + inside.message_size)
+    return Needs(isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds")), 0)
 
 
 def _filter(spec: str, argument: str) -> SafetyFilter:

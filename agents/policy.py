@@ -33,6 +33,7 @@ class EnvDescription:
         action_sizes: number of entries of each agent's action, padding included, by id.
         error_unit: unit of the task error.
         disturbance: bound on |w| of each acting agent by id, (n,) in state units per second.
+        message_size: entries at the end of each agent's action that are sent with its messages.
     """
 
     environment: str
@@ -44,6 +45,7 @@ class EnvDescription:
     action_sizes: Mapping[str, int]
     error_unit: str = "m"
     disturbance: Mapping[str, FloatArray] = field(default_factory=dict)
+    message_size: int = 0
 
     __repr__ = brief
 
@@ -97,6 +99,7 @@ def describe(env: object) -> EnvDescription:
         action_sizes=dict(zip(batched.agents, sizes.tolist(), strict=True)),
         error_unit=batched.task.error_unit(batched.world),
         disturbance={agent: pushed[fleet.state_slice(fleet.agent(agent))] for agent in batched.agents},
+        message_size=batched.settings.message_size,
     )
 
 

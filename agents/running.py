@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
-from agents.policies import make_policy, needs_bounds
+from agents.policies import make_policy, needs
 from agents.policy import Policy, describe, policy_seeds
 from agents.safety import SafetyFilter
 from khop_env.env import KHopEnv, Settings
@@ -130,8 +130,7 @@ def policy_run(
     about = _training(policy, named, scenario)
     if about.get("environment") == named:
         chosen = {"bounds": about["bounds"], **about.get("arguments", {}), **chosen}
-    if needs_bounds(policy):
-        chosen = {**chosen, "bounds": (arguments or {}).get("bounds", True)}
+    chosen |= needs(policy).among(arguments or {})
     if duration is not None:
         if "max_cycles" in (arguments or {}):
             raise ValueError("a duration and max_cycles: choose one of them for the length of the episode")

@@ -300,6 +300,11 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
                 f"estimator: {name!r} makes estimates from messages, and there is no network: choose one, e.g. "
                 "network='wifi'"
             )
+        if settings.message_size:
+            raise ValueError(
+                f"message_size={settings.message_size}: without a network there are no messages: choose one, e.g. "
+                "network='wifi'"
+            )
         return dataclasses.replace(settings, network=None), Proximal(settings.order, settings.threads)
     if settings.order != 1:
         raise ValueError(
@@ -308,7 +313,7 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
         )
     estimator = settings.estimator or scenario.estimator
     chosen = dataclasses.replace(settings, network=network, estimator=estimator)
-    return chosen, Networked(network, estimator)
+    return chosen, Networked(network, estimator, settings.message_size)
 
 
 def _chosen_scenario(scenario_or_name: Scenario | str | Path) -> Scenario:

@@ -22,20 +22,29 @@ Margin = str | float
 DRIFT: dict[type[AgentModel], float] = {SingleIntegrator: 0.0, DriftingIntegrator: 1.0}
 """Agents whose velocity is their input and a drift, with the largest drift in m/s."""
 
+ANNOUNCED = 3  # numbers in a message: the anchor as a share of observations' limit, and a flag
+
 FLOAT32 = 2.0**-24  # relative rounding of an observation or an action
 
 
-def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> Columns:
+def read_columns(env: EnvDescription, margin: Margin, radius: float | None, announce: bool = False) -> Columns:
     """The tables of the compiled part.
 
     Args:
         env: the environment.
         margin: round estimates.
         radius: of an agent's body in m; None for what observations say.
+        announce: whether agents send their anchors.
 
     Raises:
         ValueError: if agents, columns or margins don't fit.
     """
+    if announce and env.message_size < ANNOUNCED:
+        raise ValueError(
+            f"announce=True sends {ANNOUNCED} numbers with each message: make the environment with "
+            f"message_size={ANNOUNCED} or more, under a network; it has message_size={env.message_size}"
+        )
+    first_data = env.message_size - ANNOUNCED
     certified = margin == "certified"
     constant = 0.0 if isinstance(margin, str) else margin
     tracking: dict[str, FloatArray] = {}  # largest distance between an agent and its anchor
@@ -44,6 +53,8 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> C
         tracking[agent] = _tracking(agent, env)
     own, of_bodies, first, start = [], [], [0], 0
     pairs: list[tuple[IntArray, FloatArray, IntArray, FloatArray, int, FloatArray, float]] = []
+    announced: list[tuple[IntArray, int, float, FloatArray]] = []
+    pace = {agent: _pace(model) if announce else np.full(2, math.inf) for agent, model in env.models.items()}
     for agent, layout in env.layouts.items():
         if certified:
             _require_all_known(agent, layout, env)
@@ -62,6 +73,10 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> C
             widen = constant + other + _rounding(agent, env)
             apart = float(np.linalg.norm(tracking[agent]) + np.linalg.norm(other))
             pairs.append((start + place, layout.high[place].astype(float), bound, highest, valid, widen, apart))
+            if announce:
+                data = np.array([layout.index(f"{name}.message.{first_data + c}") for c in range(ANNOUNCED)])
+                age = layout.index(f"{name}.age")
+                announced.append((start + data, start + age, float(layout.high[age]), pace[slot.id]))
         first.append(len(pairs))
         start += len(layout)
     if not pairs:
@@ -72,6 +87,11 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> C
         np.array, zip(*pairs, strict=True)
     )
     speed = np.array([env.models[agent].input_limit for agent in env.agents], float)
+    anchors, ages, age_limit, pace_of_other = (
+        map(np.array, zip(*announced, strict=True))
+        if announced
+        else (np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 2)))
+    )
     return Columns(
         columns,
         limits,
@@ -91,26 +111,45 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None) -> C
         np.array([np.linalg.norm(tracking[agent]) for agent in env.agents]),
         speed,
         tracked,
+        anchors,
+        ages,
+        age_limit,
+        limits[0],
+        np.array([pace[agent] for agent in env.agents]),
+        pace_of_other,
     )
 
 
-def without_bounds(env: EnvDescription) -> tuple[dict[str, np.ndarray], EnvDescription]:
-    """An environment as it is described without bounds in its observations.
+def without_bounds(
+    env: EnvDescription, bounds: bool = False, announced: int = 0
+) -> tuple[dict[str, np.ndarray], EnvDescription]:
+    """An environment as it is described without bounds in its observations, and without the filter's data.
+
+    Args:
+        env: the environment.
+        bounds: True to leave bounds in.
+        announced: numbers at the end of messages that are the filter's.
 
     Returns:
-        By agent the columns (D_i,) that are left, and the description; no columns where there were no bounds anyway.
+        By agent the columns (D_i,) that are left, and the description; no columns where all are left.
     """
     kept, layouts = {}, {}
+    size = env.message_size - announced
+    sizes = {agent: count - announced for agent, count in env.action_sizes.items()}
+    dropped = {str(c) for c in range(size, env.message_size)}
     longest = max(env.layouts.values(), key=lambda layout: len(layout.slots)).names
     for agent, layout in env.layouts.items():
         names, padding = layout.names, f"slot{len(layout.slots)}.valid"
         if padding in names:  # columns of padded slots are where others have theirs
             names = (*names[: layout.index(padding)], *longest[layout.index(padding) :])
-        kept[agent] = np.array([q for q, name in enumerate(names) if not _is_bound(name)], np.int64)
+        kept[agent] = np.array(
+            [q for q, name in enumerate(names) if (bounds or not _is_bound(name)) and not _is_data(name, dropped)],
+            np.int64,
+        )
         layouts[agent] = ObservationLayout(agent, [layout.fields[q] for q in kept[agent]], layout.slots)
     if all(len(kept[agent]) == len(layout) for agent, layout in env.layouts.items()):
         return {}, env
-    return kept, replace(env, layouts=layouts)
+    return kept, replace(env, layouts=layouts, action_sizes=sizes, message_size=size)
 
 
 def _own(agent: str, env: EnvDescription) -> IntArray:
@@ -161,6 +200,17 @@ def _tracking(agent: str, env: EnvDescription) -> FloatArray:
             f"limited to {speed.min():g} m/s"
         )
     return found
+
+
+def _pace(model: AgentModel) -> FloatArray:
+    """(2,) fastest that an anchor moves where it is announced, in m/s."""
+    pace: FloatArray = np.asarray(model.input_limit, float) + DRIFT[type(model)]
+    return pace
+
+
+def _is_data(name: str, dropped: set[str]) -> bool:
+    slot, _, rest = name.partition(".")
+    return slot.startswith("slot") and rest.startswith("message.") and rest.removeprefix("message.") in dropped
 
 
 def _is_bound(name: str) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import EnvDescription, Observations, Policy
-from agents.safety.columns import Margin, read_columns, without_bounds
+from agents.safety.columns import ANNOUNCED, Margin, read_columns, without_bounds
 from agents.safety.moves import filter_moves
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray
@@ -51,6 +51,8 @@ class SafetyFilter:
         policy: the policy inside; it gets the observations without bounds, unless it was trained with them.
         margin: a `Margin`.
         gamma: share of the gap that two agents may use up in a period together, above 0 and at most 1.
+        announce: whether agents send their anchors in messages, so that neither disturbances nor noise widen the boxes.
+            Anchors then keep to the speed limit, so that an action may be changed where nothing is near, too.
         radius: of an agent's body in m; None for the column `radius` of observations.
         bounds: whether the policy inside observes bounds; None for what a learned policy was trained with, and no
             bounds for others.
@@ -58,6 +60,7 @@ class SafetyFilter:
     Attributes:
         policy: the policy inside.
         needs_bounds: whether the environment must be made with bounds=True.
+        needs_messages: the least message_size of the environment; the last of these numbers are the filter's.
         wanted: by agent (..., m), the actions of the policy inside, of the last `act`.
         correction: by agent (..., 2), chosen less wanted input in m/s, of the last `act`.
         intervention: by agent (...), its length.
@@ -66,7 +69,7 @@ class SafetyFilter:
             show, which then stops. It is never True while the theorem's assumptions hold.
 
     Raises:
-        ValueError: for a margin, gamma or radius out of range.
+        ValueError: for a margin, gamma or radius out of range, or anchors that aren't needed.
     """
 
     def __init__(
@@ -75,6 +78,7 @@ class SafetyFilter:
         margin: Margin = "certified",
         *,
         gamma: float = 1.0,
+        announce: bool = False,
         radius: float | None = None,
         bounds: bool | None = None,
     ) -> None:
@@ -83,6 +87,9 @@ class SafetyFilter:
         if radius is not None and not 0.0 < radius < math.inf:
             raise ValueError(f"radius must be a positive number of metres; got {radius!r}")
         self.policy, self.margin, self.gamma = policy, as_margin(margin), float(gamma)
+        if announce and self.margin != "certified":
+            raise ValueError(f"announce=True is for margin='certified'; got margin={margin!r}")
+        self.announce, self.needs_messages = bool(announce), ANNOUNCED if announce else 0
         self.radius, self._bounds = radius, bounds
         self.needs_bounds = self.margin == "certified"
         self.wanted: dict[str, Float32Array] = {}
@@ -91,7 +98,8 @@ class SafetyFilter:
         self.infeasible: dict[str, np.ndarray] = {}
 
     def __repr__(self) -> str:
-        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g})"
+        announced = ", announce=True" if self.announce else ""
+        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{announced})"
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Look up the columns, and reset the policy inside.
@@ -100,15 +108,14 @@ class SafetyFilter:
             ValueError: if the filter or the policy inside doesn't fit the environment; the message says why.
         """
         self._env = env
-        columns = read_columns(env, self.margin, self.radius)
+        columns = read_columns(env, self.margin, self.radius, self.announce)
         self._columns: Any = tuple(columns)
-        self._speed, self._own = columns.speed, columns.own
+        self._speed, self._own, self._scale = columns.speed, columns.own, columns.scale
         models = enumerate(env.models.values())
         self._drifting = {number: model for number, model in models if not isinstance(model, SingleIntegrator)}
         self._anchor, self._started = np.zeros((0, 0, 2)), np.zeros((0, 0), np.bool_)
-        self._kept, inside = without_bounds(env)
-        if self._observes_bounds(env):
-            self._kept, inside = {}, env
+        self._kept, inside = without_bounds(env, self._observes_bounds(env), self.needs_messages)
+        self._sizes = inside.action_sizes
         self.policy.reset(inside, seeds)
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
@@ -155,8 +162,13 @@ class SafetyFilter:
         safe = np.where((change > 0.0)[..., None], chosen / speed, fractions).astype(np.float32)
         actions = {}
         for number, agent in enumerate(agents):
-            action = np.array(self.wanted[agent], np.float32).reshape(batch, -1)
+            action = np.zeros((batch, self._env.action_sizes[agent]), np.float32)
+            action[:, : self._sizes[agent]] = np.asarray(self.wanted[agent], np.float32).reshape(batch, -1)
             action[:, :2] = safe[:, number]
+            if self.announce:
+                anchor = self._anchor[:, number] / self._scale
+                action[:, -ANNOUNCED:-1] = anchor
+                action[:, -1] = self._started[:, number] & (np.abs(anchor) < 1.0).all(axis=1)
             actions[agent] = action.reshape(*shape, -1)
             self.correction[agent] = correction[:, number].reshape(*shape, 2)
             self.intervention[agent] = change[:, number].reshape(shape)
@@ -167,7 +179,7 @@ class SafetyFilter:
         """(B, 2) what the policy inside wants of an agent."""
         if agent not in self.wanted:
             raise ValueError(f"the policy inside the safety filter has no action for {agent!r}")
-        wanted, expected = np.asarray(self.wanted[agent], np.float32), (batch, self._env.action_sizes[agent])
+        wanted, expected = np.asarray(self.wanted[agent], np.float32), (batch, self._sizes[agent])
         if wanted.size != batch * expected[1]:
             raise ValueError(
                 f"actions of {agent!r} must have shape {expected}, one row per environment; the policy inside the "

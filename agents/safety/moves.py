@@ -43,6 +43,12 @@ class Columns(NamedTuple):
         off: (N,) largest distance from the anchor by the theory.
         speed: (N, 2) input limits in m/s.
         tracking: (N, 2) largest observed distance from the anchor by the theory, per axis.
+        announced: (P, 3) columns of the other's anchor, as a share of `scale`, and of a flag; (0, 3) where none are.
+        age: (P,) columns of the age of what was announced, in s.
+        age_limit: (P,) ages from here on may have been clipped.
+        scale: (2,) in m.
+        pace: (N, 2) fastest that anchors move, in m/s; inf where they aren't announced.
+        pace_of_other: (P, 2) likewise, of the pair's other.
     """
 
     own: IntArray
@@ -63,6 +69,12 @@ class Columns(NamedTuple):
     off: FloatArray
     speed: FloatArray
     tracking: FloatArray
+    announced: IntArray
+    age: IntArray
+    age_limit: FloatArray
+    scale: FloatArray
+    pace: FloatArray
+    pace_of_other: FloatArray
 
 
 @compiled
@@ -123,8 +135,9 @@ def filter_moves(
             for row in range(4):
                 rows[row, 0], rows[row, 1] = (0.0, 0.0)
                 rows[row, row // 2] = 1.0 if row % 2 == 0 else -1.0
-            rows[0, 2], rows[1, 2] = max(most_x + to_x, 0.0), max(most_x - to_x, 0.0)
-            rows[2, 2], rows[3, 2] = max(most_y + to_y, 0.0), max(most_y - to_y, 0.0)
+            pace_x, pace_y = columns.pace[i, 0] * period, columns.pace[i, 1] * period
+            rows[0, 2], rows[1, 2] = min(max(most_x + to_x, 0.0), pace_x), min(max(most_x - to_x, 0.0), pace_x)
+            rows[2, 2], rows[3, 2] = min(max(most_y + to_y, 0.0), pace_y), min(max(most_y - to_y, 0.0), pace_y)
             radius = columns.body
             if columns.radius[i] >= 0:
                 radius = ROUNDED * float(observations[b, columns.radius[i]])
@@ -158,10 +171,25 @@ def filter_moves(
                     break
                 half_x = hx * ROUNDED + abs(x) * EPSILON + columns.widen[pair, 0]
                 half_y = hy * ROUNDED + abs(y) * EPSILON + columns.widen[pair, 1]
+                if columns.announced.shape[0] and observations[b, columns.announced[pair, 2]] > 0.5:
+                    age = float(observations[b, columns.age[pair]])
+                    if age < columns.age_limit[pair]:
+                        x, half_x = _meet(
+                            x,
+                            half_x,
+                            columns.scale[0] * float(observations[b, columns.announced[pair, 0]]) - px,
+                            columns.pace_of_other[pair, 0] * age * ROUNDED + EPSILON * columns.scale[0],
+                        )
+                        y, half_y = _meet(
+                            y,
+                            half_y,
+                            columns.scale[1] * float(observations[b, columns.announced[pair, 1]]) - py,
+                            columns.pace_of_other[pair, 1] * age * ROUNDED + EPSILON * columns.scale[1],
+                        )
                 distance = 2.0 * radius + columns.apart[pair] + SLACK
                 used = box_rows(x + off_x, y + off_y, half_x, half_y, distance, gamma, reach, rows, used)
             broken = used < 0
-            for m in range(4, used):
+            for m in range(used):
                 broken = broken or rows[m, 0] * wx + rows[m, 1] * wy > rows[m, 2] + TOLERANCE
             if broken:
                 zx = zy = 0.0
@@ -173,3 +201,12 @@ def filter_moves(
                 chosen[b, i, 0], chosen[b, i, 1] = wanted[b, i, 0], wanted[b, i, 1]
             anchor[b, i, 0] += zx
             anchor[b, i, 1] += zy
+
+
+@compiled
+def _meet(x: float, half: float, other: float, other_half: float) -> tuple[float, float]:
+    """Centre and half width of what two intervals have in common; the first if they are disjoint."""
+    low, high = max(x - half, other - other_half), min(x + half, other + other_half)
+    if low > high:
+        return x, half
+    return 0.5 * (low + high), 0.5 * (high - low) * ROUNDED

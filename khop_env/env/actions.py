@@ -20,6 +20,7 @@ class ActionReader:
         members: indices of those that act.
         uniform: whether all have as many entries, padded.
         num_envs: number of environments B.
+        message_size: entries at the end of each agent's action that are data for its messages.
 
     Attributes:
         offset: (N + 1,) where each agent's entries begin in the flat action.
@@ -28,7 +29,9 @@ class ActionReader:
         ValueError: for an acting agent whose inputs have no limit.
     """
 
-    def __init__(self, fleet: Fleet, members: Sequence[int], uniform: bool, num_envs: int) -> None:
+    def __init__(
+        self, fleet: Fleet, members: Sequence[int], uniform: bool, num_envs: int, message_size: int = 0
+    ) -> None:
         self._agents, self._num_envs, self._uniform = [fleet.ids[i] for i in members], num_envs, uniform
         models = [fleet.models[i] for i in members]
         unlimited = [
@@ -40,12 +43,19 @@ class ActionReader:
                 "an input_limit"
             )
         sizes = np.array([model.m for model in models])
-        self.offset: IntArray = np.concatenate([[0], np.cumsum(np.full(len(sizes), sizes.max()) if uniform else sizes)])
+        entries = (np.full(len(sizes), sizes.max()) if uniform else sizes) + message_size
+        self.offset: IntArray = np.concatenate([[0], np.cumsum(entries)])
         parts = [(number, c) for number, size in enumerate(sizes) for c in range(size)]
         first = fleet.input_offset[list(members)]
-        self._owner = np.array([number for number, _ in parts], np.int64)
-        self._entry = np.array([self.offset[number] + c for number, c in parts], np.int64)
+        words = [(number, c) for number in range(len(sizes)) for c in range(message_size)]
+        self._owner = np.array([number for number, _ in (*parts, *words)], np.int64)
+        self._entry = np.array(
+            [self.offset[number] + c for number, c in parts]
+            + [self.offset[number + 1] - message_size + c for number, c in words],
+            np.int64,
+        )
         self._column = np.array([first[number] + c for number, c in parts], np.int64)
+        self._said = np.array([members[number] * message_size + c for number, c in words], np.int64)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
@@ -54,12 +64,13 @@ class ActionReader:
         flat: list[tuple[int, ...]] = [(self._num_envs, width)]
         return [(self._num_envs, len(self._agents), width // len(self._agents)), *flat] if self._uniform else flat
 
-    def read(self, actions: ArrayLike, command: FloatArray) -> IntArray:
-        """Write actions into `command` (m, B) as fractions of the limits, clipped to [-1, 1].
+    def read(self, actions: ArrayLike, command: FloatArray, said: FloatArray) -> IntArray:
+        """Write actions into `command` (m, B) as fractions of the limits, clipped to [-1, 1], and data into `said`.
 
         Args:
             actions: (B, N, m) or (B, A).
             command: (m, B) overwritten in the rows of acting agents; unchanged if this raises.
+            said: (agents of the fleet * message_size, B) likewise; clipped to [-1, 1].
 
         Returns:
             (B, N) number of clipped entries of each agent's action.
@@ -74,7 +85,7 @@ class ActionReader:
             )
         flat = np.ascontiguousarray(array.reshape(self._num_envs, -1), np.float64)
         clipped = np.zeros((self._num_envs, len(self._agents)), np.int64)
-        bad = read_actions(flat, self._entry, self._column, self._owner, command, clipped)
+        bad = read_actions(flat, self._entry, self._column, self._said, self._owner, command, said, clipped)
         if bad >= 0:
             env, number = divmod(bad, len(self._entry))
             owner = self._owner[number]
@@ -88,16 +99,25 @@ class ActionReader:
 
 @compiled
 def read_actions(
-    actions: FloatArray, entry: IntArray, column: IntArray, owner: IntArray, command: FloatArray, clipped: IntArray
+    actions: FloatArray,
+    entry: IntArray,
+    column: IntArray,
+    row: IntArray,
+    owner: IntArray,
+    command: FloatArray,
+    said: FloatArray,
+    clipped: IntArray,
 ) -> int:
-    """Clip actions to [-1, 1] and write them into `command` (m, B); count the clipped entries.
+    """Clip actions to [-1, 1] and write them into `command` (m, B) and `said`; count the clipped entries.
 
     Args:
         actions: (B, A) all agents' actions of each environment, side by side.
-        entry: (C,) which entry of an environment's actions is read.
-        column: (C,) the input it becomes.
-        owner: (C,) number of the agent that it belongs to.
+        entry: (C + D,) which entry of an environment's actions is read.
+        column: (C,) the inputs that the first C become.
+        row: (D,) the rows of `said` that the others become.
+        owner: (C + D,) number of the agent that it belongs to.
         command: (m, B) overwritten at `column`.
+        said: (S, B) overwritten at `row`.
         clipped: (B, N) added to.
 
     Returns:
@@ -117,5 +137,8 @@ def read_actions(
             elif value < -1.0:
                 value = -1.0
                 clipped[env, owner[q]] += 1
-            command[column[q], env] = value
+            if q < column.size:
+                command[column[q], env] = value
+            else:
+                said[row[q - column.size], env] = value
     return -1

@@ -80,11 +80,12 @@ class BatchedEnv:
             bounds=settings.bounds,
             uniform=settings.uniform,
             inputs=settings.inputs_are_states,
+            message_size=settings.message_size,
         )
         self.layouts: tuple[ObservationLayout, ...] = tuple(observed.layouts)
         self.observation_offset, self._read_observations = observed.offset, observed.readout
         self.state_fields, self._read_state = global_state(self.fleet, settings.limit, settings.inputs_are_states)
-        self._actions = ActionReader(self.fleet, members, settings.uniform, self.num_envs)
+        self._actions = ActionReader(self.fleet, members, settings.uniform, self.num_envs, settings.message_size)
         self.action_offset: IntArray = self._actions.offset
         acting = np.zeros(self.fleet.m, bool)
         for i in members:
@@ -93,6 +94,8 @@ class BatchedEnv:
         self._limit = self.fleet.input_limit[:, None]
         self._scale = np.where(np.isfinite(self._limit), self._limit, 1.0)
         observers = simulator.observers
+        nothing = np.zeros((0, self.num_envs))
+        self._said, data = (state.memory.get(name, nothing) for name in ("said", "data"))
         bounded = len(state.memory["estimate"]) if self._read_observations.uses_bounds else 0
         changing = simulator.design.schedule is not None and not observers.by_messages
         self._received = ReceivedStates(simulator.design, observers, self.num_envs) if changing else None
@@ -104,6 +107,7 @@ class BatchedEnv:
             inputs,
             np.zeros((self._read_observations.task_rows, self.num_envs)),
             np.zeros((known, self.num_envs)),
+            data,
         )
         self._parts = simulator.parts_of(settings.control_period / settings.substeps)
         self._command, self._physical = np.zeros_like(inputs), np.zeros_like(inputs)
@@ -179,7 +183,7 @@ class BatchedEnv:
             SolveError: if a state becomes infinite.
         """
         self._require_running(ended)
-        self._clipped_actions = self._actions.read(actions, self._command)
+        self._clipped_actions = self._actions.read(actions, self._command, self._said)
         self.simulator.restart_extremes()
         for number in range(self.settings.substeps):
             self._advance(number)

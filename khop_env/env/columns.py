@@ -11,6 +11,7 @@ from khop_env.env.layout import Feature, Field, ObservationLayout, Slot, feature
 from khop_env.env.readout import (
     AGE,
     BOUND,
+    DATA,
     ESTIMATE,
     ESTIMATE_COS,
     ESTIMATE_RELATIVE,
@@ -52,6 +53,7 @@ class ObservationColumns:
         bounds: whether slots hold the guaranteed bound on the estimate's error.
         uniform: True for the same columns for every agent, padded; False for each agent's own columns.
         inputs: whether an agent observes its input in force, which an actuator may make a state.
+        message_size: numbers of policies in messages.
 
     Attributes:
         layouts: one per agent.
@@ -70,12 +72,14 @@ class ObservationColumns:
         bounds: bool,
         uniform: bool,
         inputs: bool,
+        message_size: int = 0,
     ) -> None:
         design = world.design
         self._world, self._task, self._design, self._fleet, self._observe = world, task, design, design.fleet, observe
         self._layout, self._by_messages = observers.layout, observers.by_messages
         self._changing = design.schedule is not None and not observers.by_messages
         self._bounds, self._uniform, self._limit, self._inputs = bounds, uniform, world.limit, inputs
+        self._message_size = message_size
         models = self._fleet.models
         self._types = list(dict.fromkeys(model.type for model in models))
         self._axes = axis_names(self._fleet.position_dim)
@@ -165,6 +169,11 @@ class ObservationColumns:
         columns += self._padding(name, self._most_rest - len(rest))
         if self._bounds:
             columns += self._bound_columns(i, name, slot, estimated)
+        if self._message_size:
+            first = int(self._layout.column_pair[self._layout.slot[i, slot.agent]]) * self._message_size
+            columns += [
+                Column(Field(f"{name}.message.{c}", "", -1.0, 1.0), DATA, first + c) for c in range(self._message_size)
+            ]
         if self._observe == "local" and not slot.heard:
             return [Column(column.field) for column in columns]
         return columns

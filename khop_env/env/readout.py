@@ -12,10 +12,10 @@ from khop_env.compiled import compiled
 from khop_env.env.layout import Field, Float32Array
 from khop_env.observers import FloatArray, IntArray
 
-# sources of a column's value: none, states, estimates, their guaranteed bounds, inputs, the task's own rows, and
-# what is known of the messages that an estimate rests on
+# sources of a column's value: none, states, estimates, their guaranteed bounds, inputs, the task's own rows, what is
+# known of the messages that an estimate rests on, and a policy's data in them
 CONSTANT, STATE, STATE_COS, STATE_SIN, STATE_RELATIVE = range(5)
-ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, BOUND, INPUT, TASK, KNOWN = range(5, 13)
+ESTIMATE, ESTIMATE_COS, ESTIMATE_SIN, ESTIMATE_RELATIVE, BOUND, INPUT, TASK, KNOWN, DATA = range(5, 14)
 # quantities of a column KNOWN, whose row is quantity * pairs + pair
 VALID, HEARD, HOPS, AGE = range(4)
 _TILE = 32  # number of environments whose values of a column are computed before they are written
@@ -60,6 +60,7 @@ class Sources(NamedTuple):
         task: (rows, B) values of the task's live columns.
         known: (4 pairs, B) the quantities that `summarize` writes, of observers that exchange messages; without
             messages (L, B) whether each link is up, where links come and go.
+        data: (rows, B) of policies, as it has arrived with messages.
     """
 
     x: FloatArray
@@ -68,6 +69,7 @@ class Sources(NamedTuple):
     inputs: FloatArray
     task: FloatArray
     known: FloatArray
+    data: FloatArray
 
 
 class _LiveColumns(NamedTuple):
@@ -164,6 +166,9 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
             elif kind == KNOWN:
                 for e in range(width):
                     values[e] = sources.known[row, first + e]
+            elif kind == DATA:
+                for e in range(width):
+                    values[e] = sources.data[row, first + e]
             elif kind == STATE_COS:
                 for e in range(width):
                     values[e] = np.cos(x[row, first + e])

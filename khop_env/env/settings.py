@@ -15,6 +15,7 @@ from khop_env.observers.proximal import MOST_THREADS
 from khop_env.physics import did_you_mean
 from khop_env.simulation import OBSERVE, Observe
 
+MOST_DATA = 1000  # numbers of a policy in a message
 NUMBER = (int, float, np.integer, np.floating)
 
 
@@ -42,6 +43,8 @@ class Settings:
             the scenario's own, which by default is that, too.
         estimator: from messages to estimates under a network: "ppso" for the paper's observers, "relay" for stamped
             states that are passed on, or an `Estimator`; None for the scenario's own, "ppso" by default.
+        message_size: numbers that a policy adds to its agent's messages: the last entries of its action. They are
+            passed on with the agent's state, and arrive in the slots of others. Needs a network.
 
     Raises:
         ValueError: for an argument out of range; the message names it, its value and the valid range.
@@ -59,6 +62,7 @@ class Settings:
     threads: int = 1
     network: str | Network | Mapping[str, object] | None = None
     estimator: str | Estimator | None = None
+    message_size: int = 0
 
     def __post_init__(self) -> None:
         if self.observe not in OBSERVE:
@@ -77,6 +81,9 @@ class Settings:
                 raise ValueError(f"{name} must be a positive integer; got {value!r}")
         if self.threads > MOST_THREADS:
             raise ValueError(f"threads must be at most {MOST_THREADS}; got {self.threads!r}")
+        size = self.message_size
+        if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 0 <= size <= MOST_DATA:
+            raise ValueError(f"message_size must be an integer from 0 to {MOST_DATA}; got {size!r}")
         for name in ("control_period", "dt", "limit"):
             value = getattr(self, name)
             if value is None and name == "dt":
@@ -150,3 +157,4 @@ class SettingsArguments(TypedDict, total=False):
     threads: int
     network: str | Network | Mapping[str, object] | None
     estimator: str | Estimator | None
+    message_size: int

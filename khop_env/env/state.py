@@ -93,6 +93,7 @@ def signature(
         "control periods": (steps,),
         "networks": ("none" if networked is None else described(networked.network),),
         "estimators": () if networked is None else (networked.estimator.name,),
+        "message sizes": (str(settings.message_size),),
         "schedules": () if design.schedule is None else tuple(map(_as_text, design.schedule.parts)),
         "disturbances": ("none" if disturbance is None else described(disturbance),),
         "bounds": tuple(bounds),

@@ -23,6 +23,7 @@ class Sources(NamedTuple):
         stamp: row of its stamp: that of the message's time where the target itself sends.
         hops: row of the number of links that it has come already; -1 for the target itself.
         error: first row of its certified error; -1 for the target itself.
+        data: first row of the target's data.
         column: (pairs,) first column of the pair's prediction.
         components: (pairs,) of its state.
     """
@@ -33,37 +34,42 @@ class Sources(NamedTuple):
     stamp: IntArray
     hops: IntArray
     error: IntArray
+    data: IntArray
     column: IntArray
     components: IntArray
 
     @staticmethod
-    def of(layout: PairLayout, agents: int) -> Sources:
+    def of(layout: PairLayout, components_of_all: int, agents: int, message_size: int) -> Sources:
         """The sources of a layout of all agents within k hops.
 
-        What is sent has these rows: the message's time; the states of all `agents` components of the fleet; the
-        predictions and their certified errors (P each) and then the stamps and the hops (pairs each) of all pairs.
+        What is sent has these rows: the message's time; the states of the fleet, of `components_of_all` in all; the
+        predictions and their certified errors (P each) and then the stamps and the hops (pairs each) of all pairs; the
+        data of all `agents`, and what each pair holds of its target's, `message_size` rows each.
         """
         arrays, sender = layout.arrays, layout.links.sender
-        start, found = [0], list[tuple[int, int, int, int, int]]()
+        start, found = [0], list[tuple[int, int, int, int, int, int]]()
+        first_data = 1 + components_of_all + 2 * (layout.size + layout.pairs)
         column, components = [], []
         for block in layout.blocks:
             for place, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
+                own_data = first_data + int(layout.pair_target[pair]) * message_size
                 ways = [
-                    (link, 1 + block.sources.start, TIME, -1, -1)
+                    (link, 1 + block.sources.start, TIME, -1, -1, own_data)
                     for link in layout.relay_link[layout.relay_start[pair] : layout.relay_start[pair + 1]].tolist()
                 ]
                 part = slice(arrays.entry_start[pair], arrays.entry_start[pair + 1])
                 for other, link in zip(arrays.entry[part].tolist(), layout.entry_link[part].tolist(), strict=True):
-                    state = 1 + agents + block.columns.start + other * block.components
-                    stamp = 1 + agents + 2 * layout.size + block.pairs.start + other
-                    ways.append((link, state, stamp, stamp + layout.pairs, state + layout.size))
+                    state = 1 + components_of_all + block.columns.start + other * block.components
+                    stamp = 1 + components_of_all + 2 * layout.size + block.pairs.start + other
+                    data = first_data + (agents + block.pairs.start + other) * message_size
+                    ways.append((link, state, stamp, stamp + layout.pairs, state + layout.size, data))
                 found += sorted(ways, key=lambda way: int(sender[way[0]]))
                 start.append(len(found))
                 column.append(block.columns.start + place * block.components)
                 components.append(block.components)
-        link, state, stamps, hops, errors = np.array(found, np.int64).reshape(-1, 5).T.copy()
+        link, state, stamps, hops, errors, data = np.array(found, np.int64).reshape(-1, 6).T.copy()
         first, places, sizes = (np.array(values, np.int64) for values in (start, column, components))
-        return Sources(first, link, state, stamps, hops, errors, places, sizes)
+        return Sources(first, link, state, stamps, hops, errors, data, places, sizes)
 
 
 @compiled
@@ -83,6 +89,7 @@ def merge(
     stamp: FloatArray,
     hops: FloatArray,
     arrived: FloatArray,
+    data: FloatArray,
     lag: FloatArray,
 ) -> bool:
     """Take over what is fresher than what is held, from the messages that have just arrived.
@@ -104,13 +111,14 @@ def merge(
         stamp: (pairs, B) when the state behind each was measured, -1 for none; changed.
         hops: (pairs, B) links over which it came; changed.
         arrived: (pairs, B) when; changed.
+        data: (pairs * message_size, B) what else the target has sent with that state; changed.
         lag: (pairs, B) time from the message that was taken over to `t`, in s, else 0; written.
 
     Returns:
         Whether any of these is positive.
     """
-    start, link, state, stamp_row, hops_row, error_row, column, components = sources
-    capacity, batch = sent.shape[0], t.size
+    start, link, state, stamp_row, hops_row, error_row, data_row, column, components = sources
+    capacity, batch, message_size = sent.shape[0], t.size, data.shape[0] // max(column.size, 1)
     choice = np.empty(batch, np.int64)
     place = np.empty(newest.shape, np.int64)  # in the ring, -1 where nothing is to be read
     for over in range(newest.shape[0]):
@@ -143,6 +151,12 @@ def merge(
                     at = place[link[way], b]
                     center[q, b] = sent[at, state[way] + c, b]
                     error[q, b] = noise if error_row[way] < 0 else sent[at, error_row[way] + c, b]
+        for c in range(message_size):
+            q = pair * message_size + c
+            for b in range(batch):
+                way = choice[b]
+                if way >= 0:
+                    data[q, b] = sent[place[link[way], b], data_row[way] + c, b]
         for b in range(batch):
             way = choice[b]
             if way >= 0:

@@ -42,6 +42,8 @@ class Networked:
     Args:
         network: how often agents send, and what becomes of messages; anything that `Network.of` reads.
         estimator: a name of `ESTIMATORS`, or an `Estimator`.
+        message_size: numbers that each agent's policy adds to its message. They are stored and forwarded with its
+            state: the memory `said` (N * message_size, B) is sent, `data` (pairs * message_size, B) has arrived.
 
     Attributes:
         network: a `Network`.
@@ -58,11 +60,16 @@ class Networked:
     by_messages = True
     copied = False
 
-    def __init__(self, network: Network | Mapping[str, object] | str, estimator: str | Estimator = "ppso") -> None:
+    def __init__(
+        self,
+        network: Network | Mapping[str, object] | str,
+        estimator: str | Estimator = "ppso",
+        message_size: int = 0,
+    ) -> None:
         found = Network.of(network)
         if found is None:
             raise ValueError("Networked needs a network, e.g. 'wifi'; without one states are exchanged continuously")
-        self.network, self.estimator = found, as_estimator(estimator)
+        self.network, self.estimator, self.message_size = found, as_estimator(estimator), message_size
 
     def __repr__(self) -> str:
         return f"Networked({self.network.described()}; {self.estimator.name})"
@@ -75,13 +82,13 @@ class Networked:
         self.uncertified = {i: each.reason for i, each in enumerate(received) if each.reason}
         self._reckoning = Reckoning(layout, received, num_envs)
         self.longest_step = min(self.network.period, self._reckoning.longest_step)
-        sources = Sources.of(layout, fleet.n)
+        sources = Sources.of(layout, fleet.n, len(fleet), self.message_size)
         self._sources: Any = tuple(sources)
         self._pairs = sources.column, sources.components
         regions = np.concatenate([each.region for each in received])
         self._region = regions[layout.column_source]
         self.estimator = copy.copy(self.estimator)  # its buffers are this object's own
-        shared = 1 + fleet.n + 2 * (layout.size + layout.pairs)
+        shared = 1 + fleet.n + 2 * (layout.size + layout.pairs) + self.message_size * (len(fleet) + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         require_memory(self.estimator, sources.components)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
@@ -104,6 +111,8 @@ class Networked:
             "stamp": np.zeros((pairs, batch)),
             "hops": np.zeros((pairs, batch)),
             "arrived": np.zeros((pairs, batch)),
+            "said": np.zeros((len(self.design.fleet) * self.message_size, batch)),
+            "data": np.zeros((pairs * self.message_size, batch)),
             "step": np.zeros(batch),
             "even_since": np.zeros(batch),
             **self.estimator.allocate(),
@@ -119,7 +128,7 @@ class Networked:
         memory["error"][:, env_ids] = self._assumed.radius[self.layout.column_source][:, None]
         for name in ("stamp", "arrived"):
             memory[name][:, env_ids] = -1.0
-        for name in ("hops", "input_estimate", "step", "even_since"):
+        for name in ("hops", "input_estimate", "said", "data", "step", "even_since"):
             memory[name][..., env_ids] = 0.0
         self.channel.reset(self._of_channel(memory), env_ids, rngs)
         heard = memory[_CHANNEL + "heard"].copy()
@@ -217,7 +226,7 @@ class Networked:
         """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived."""
         memory, channel = state.memory, self._of_channel(state.memory)
         shared = [state.t[None], self._measured]
-        shared += [memory[name] for name in ("center", "error", "stamp", "hops")]
+        shared += [memory[name] for name in ("center", "error", "stamp", "hops", "said", "data")]
         added = self.estimator.message(state)
         if sum(map(len, added)) != self.estimator.width:
             raise ValueError(
@@ -252,6 +261,7 @@ class Networked:
             memory["stamp"],
             memory["hops"],
             memory["arrived"],
+            memory["data"],
             self._lag,
         )
         if behind:

@@ -19,7 +19,13 @@ from khop_env.testing.subject import Fault, Subject, called, play
 from khop_env.testing.views import copies
 
 _VISIBLE = ("t", "x", "estimate")  # the parts of the simulator's state that observations may depend on
-_OF_PAIRS = ("bound", "stamp", "hops", "arrived")  # and under a network what an agent knows of its own estimates
+_OF_PAIRS = (
+    "bound",
+    "stamp",
+    "hops",
+    "arrived",
+    "data",
+)  # and under a network what an agent knows of its own estimates
 _LOSS = 0.5  # of messages, so that about half of an agent's neighbours don't get its next one
 
 
@@ -48,7 +54,11 @@ def leak(subject: Subject) -> str | None:
         seen_by = set() if mode == "oracle" or (mode == "local" and not observers.by_messages) else {j}
         _require(env, seen_by, f"an estimate that {agent!r} makes", _edit(_array("estimate"), made[0]))
         for name in _OF_PAIRS if observers.by_messages else ():
-            edit = _edit(_array(name), made[0] if name == "bound" else made[1])
+            rows = made[0] if name == "bound" else made[1]
+            if name == "data":
+                size = settings.message_size
+                rows = (rows[:, None] * size + np.arange(size)).ravel()
+            edit = _edit(_array(name), rows)
             _require(env, {j}, f"{agent!r}'s {name}", edit)
     for name in env.get_state().simulator.arrays():
         edit = _edit(_array(name), ...)

@@ -8,7 +8,7 @@ import pytest
 
 from agents import compare, describe, make_policy, shielded
 from agents.navigation import KeepRight
-from agents.policies import needs_bounds
+from agents.policies import needs
 from agents.policy import by_agent
 from agents.safety.columns import without_bounds
 from khop_env.observers import Exponential, TargetObservers
@@ -198,7 +198,7 @@ def test_policies_by_name():
     assert (policy.margin, policy.policy.parameters) == ("certified", {"gain": 2.0, "cancel_drift": True})
     assert make_policy("filter:margin=0.3,gamma=0.5:zero").margin == 0.3
     assert isinstance(make_policy("filter").policy, KeepRight)
-    assert [needs_bounds(make_policy(f"filter:margin={margin}:zero")) for margin in ("certified", "none")] == [
+    assert [needs(make_policy(f"filter:margin={margin}:zero")).bounds for margin in ("certified", "none")] == [
         True,
         False,
     ]
