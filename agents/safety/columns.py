@@ -22,7 +22,7 @@ Margin = str | float
 DRIFT: dict[type[AgentModel], float] = {SingleIntegrator: 0.0, DriftingIntegrator: 1.0}
 """Agents whose velocity is their input and a drift, with the largest drift in m/s."""
 
-ANNOUNCED = 3  # numbers in a message: the anchor as a share of observations' limit, and a flag
+ANNOUNCED = 4  # numbers in a message: the anchor as a share of observations' limit, and two flags
 
 FLOAT32 = 2.0**-24  # relative rounding of an observation or an action
 
@@ -90,7 +90,7 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
     anchors, ages, age_limit, pace_of_other = (
         map(np.array, zip(*announced, strict=True))
         if announced
-        else (np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 2)))
+        else (np.zeros((0, ANNOUNCED), np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 2)))
     )
     return Columns(
         columns,

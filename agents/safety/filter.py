@@ -14,7 +14,7 @@ import numpy as np
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.policy import EnvDescription, Observations, Policy
 from agents.safety.columns import ANNOUNCED, Margin, read_columns, without_bounds
-from agents.safety.moves import filter_moves
+from agents.safety.moves import filter_moves, periods_of_rest
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray
 from khop_env.physics import SingleIntegrator
@@ -113,7 +113,7 @@ class SafetyFilter:
         self._speed, self._own, self._scale = columns.speed, columns.own, columns.scale
         models = enumerate(env.models.values())
         self._drifting = {number: model for number, model in models if not isinstance(model, SingleIntegrator)}
-        self._anchor, self._started = np.zeros((0, 0, 2)), np.zeros((0, 0), np.bool_)
+        self._begin(0)
         self._kept, inside = without_bounds(env, self._observes_bounds(env), self.needs_messages)
         self._sizes = inside.action_sizes
         self.policy.reset(inside, seeds)
@@ -140,7 +140,7 @@ class SafetyFilter:
         if self._started.shape[0] != batch:
             if self._started.size:
                 raise ValueError(f"the batch of observations changed from {len(self._started)} to {batch}: reset first")
-            self._anchor, self._started = np.zeros((batch, len(agents), 2)), np.zeros((batch, len(agents)), np.bool_)
+            self._begin(batch)
         fractions = np.stack([self._wanted(agent, batch) for agent in agents], axis=1)
         speed = self._speed
         wanted = np.clip(fractions, -1.0, 1.0, dtype=np.float64) * speed
@@ -154,6 +154,7 @@ class SafetyFilter:
             self.gamma,
             self._anchor,
             self._started,
+            self._resting,
             chosen,
             infeasible,
         )
@@ -167,13 +168,20 @@ class SafetyFilter:
             action[:, :2] = safe[:, number]
             if self.announce:
                 anchor = self._anchor[:, number] / self._scale
-                action[:, -ANNOUNCED:-1] = anchor
-                action[:, -1] = self._started[:, number] & (np.abs(anchor) < 1.0).all(axis=1)
+                action[:, -ANNOUNCED:-2] = anchor
+                action[:, -2] = self._started[:, number] & (np.abs(anchor) < 1.0).all(axis=1)
+                action[:, -1] = self._resting[:, number] == periods_of_rest(self._env.control_period)
             actions[agent] = action.reshape(*shape, -1)
             self.correction[agent] = correction[:, number].reshape(*shape, 2)
             self.intervention[agent] = change[:, number].reshape(shape)
             self.infeasible[agent] = infeasible[:, number].reshape(shape)
         return actions
+
+    def _begin(self, batch: int) -> None:
+        """No agent has an anchor."""
+        shape = batch, len(self._env.agents)
+        self._anchor, self._started = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
+        self._resting = np.zeros(shape, np.int64)
 
     def _wanted(self, agent: str, batch: int) -> Float32Array:
         """(B, 2) what the policy inside wants of an agent."""

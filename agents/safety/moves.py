@@ -16,6 +16,9 @@ from khop_env.compiled import compiled
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray, IntArray
 
+REST = 0.05  # of the pace: what an agent at rest announces as its pace for the next `REST_TIME`
+REST_TIME = 2.0  # s
+AT_REST = 0.25  # of the speed limit: an agent whose wanted input is at most this is at rest
 SLACK = 1e-6  # m: added to distances for that, and for rounding, of more periods than an episode has
 EPSILON = 2.0**-23  # twice the relative rounding of a float32
 ROUNDED = 1.0 + EPSILON
@@ -43,7 +46,8 @@ class Columns(NamedTuple):
         off: (N,) largest distance from the anchor by the theory.
         speed: (N, 2) input limits in m/s.
         tracking: (N, 2) largest observed distance from the anchor by the theory, per axis.
-        announced: (P, 3) columns of the other's anchor, as a share of `scale`, and of a flag; (0, 3) where none are.
+        announced: (P, 4) columns of the other's anchor, as a share of `scale`, of a flag, and whether it is at rest;
+            (0, 4) where nothing is announced.
         age: (P,) columns of the age of what was announced, in s.
         age_limit: (P,) ages from here on may have been clipped.
         scale: (2,) in m.
@@ -87,6 +91,7 @@ def filter_moves(
     gamma: float,
     anchor: FloatArray,
     started: NDArray[np.bool_],
+    resting: IntArray,
     chosen: FloatArray,
     infeasible: NDArray[np.bool_],
 ) -> None:
@@ -101,12 +106,16 @@ def filter_moves(
         gamma: share of the gap that two agents together may use up in a period.
         anchor: (B, N, 2) moved; set where an agent has none.
         started: (B, N) whether an agent has an anchor.
+        resting: (B, N) control periods for which an agent has still to keep the pace that it announced; changed.
         chosen: (B, N, 2) overwritten with the inputs; exactly `wanted` where nothing is near.
         infeasible: (B, N) overwritten: the agent isn't where its last move should have brought it, or may be outside of
             what observations show.
     """
     columns = Columns(*columns)
     agents = columns.own.shape[0]
+    most_resting = 0  # from the next control period on
+    if columns.announced.shape[0]:
+        most_resting = periods_of_rest(period)
     most = 0
     for i in range(agents):
         most = max(most, columns.first[i + 1] - columns.first[i])
@@ -136,6 +145,13 @@ def filter_moves(
                 rows[row, 0], rows[row, 1] = (0.0, 0.0)
                 rows[row, row // 2] = 1.0 if row % 2 == 0 else -1.0
             pace_x, pace_y = columns.pace[i, 0] * period, columns.pace[i, 1] * period
+            if resting[b, i] > 0:
+                pace_x, pace_y = REST * pace_x, REST * pace_y
+                resting[b, i] -= 1
+            if abs(wanted[b, i, 0]) <= AT_REST * columns.speed[i, 0] and (
+                abs(wanted[b, i, 1]) <= AT_REST * columns.speed[i, 1]
+            ):
+                resting[b, i] = most_resting
             rows[0, 2], rows[1, 2] = min(max(most_x + to_x, 0.0), pace_x), min(max(most_x - to_x, 0.0), pace_x)
             rows[2, 2], rows[3, 2] = min(max(most_y + to_y, 0.0), pace_y), min(max(most_y - to_y, 0.0), pace_y)
             radius = columns.body
@@ -174,17 +190,20 @@ def filter_moves(
                 if columns.announced.shape[0] and observations[b, columns.announced[pair, 2]] > 0.5:
                     age = float(observations[b, columns.age[pair]])
                     if age < columns.age_limit[pair]:
+                        way = age * ROUNDED  # at full pace
+                        if observations[b, columns.announced[pair, 3]] > 0.5:
+                            way = max(way - (1.0 - REST) * REST_TIME, REST * way)
                         x, half_x = _meet(
                             x,
                             half_x,
                             columns.scale[0] * float(observations[b, columns.announced[pair, 0]]) - px,
-                            columns.pace_of_other[pair, 0] * age * ROUNDED + EPSILON * columns.scale[0],
+                            columns.pace_of_other[pair, 0] * way + EPSILON * columns.scale[0],
                         )
                         y, half_y = _meet(
                             y,
                             half_y,
                             columns.scale[1] * float(observations[b, columns.announced[pair, 1]]) - py,
-                            columns.pace_of_other[pair, 1] * age * ROUNDED + EPSILON * columns.scale[1],
+                            columns.pace_of_other[pair, 1] * way + EPSILON * columns.scale[1],
                         )
                 distance = 2.0 * radius + columns.apart[pair] + SLACK
                 used = box_rows(x + off_x, y + off_y, half_x, half_y, distance, gamma, reach, rows, used)
@@ -201,6 +220,12 @@ def filter_moves(
                 chosen[b, i, 0], chosen[b, i, 1] = wanted[b, i, 0], wanted[b, i, 1]
             anchor[b, i, 0] += zx
             anchor[b, i, 1] += zy
+
+
+@compiled
+def periods_of_rest(period: float) -> int:
+    """Control periods, after the present one, in which an agent keeps the pace that it announces now."""
+    return math.ceil(REST_TIME / period - 1e-9)
 
 
 @compiled
