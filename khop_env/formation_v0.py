@@ -57,6 +57,7 @@ neighbours are estimated, too, and slots say how old the information is that an 
 | slot0.hops                  | number of links over which the newest has come; 0 before anything has arrived     |
 | slot0.age                   | time since the newest was measured, in s; before anything has arrived: since reset |
 | slot0.bound.<state>         | certified bound on this very estimate's error, for neighbours, too                |
+| slot0.message.0 ...         | data of its policy, as it sent them with that state; `message_size` only          |
 
 With `observe="oracle"` all slots have true states and are valid; with `observe="local"` neighbours are estimated from
 messages, and the slots of k-hop targets are zeros.
@@ -80,6 +81,9 @@ received.
 
 Each agent's inputs as fractions of their limits, in [-1, 1]; larger values are clipped and counted in the infos. With
 uniform observations all agents have as many entries as the largest, and ignore entries without an input.
+
+With `message_size` above 0, an action has as many entries more, at its end: data that the agent sends with its messages
+from the end of this control period on. They are passed on with its state, and arrive, or get lost, with it.
 
 ### Reward
 
@@ -107,7 +111,8 @@ from khop_env import formation_v0
 
 formation_v0.parallel_env(scenario="paper", observe="estimate", bounds=False, uniform=True, max_cycles=200,
 control_period=0.05, dt=None, order=1, actuator="direct", reward="agent", effort=0.1, success_radius=None,
-limit=100.0, threads=1, network=None, estimator=None, render_mode=None,
+limit=100.0, threads=1, network=None, estimator=None, message_size=0,
+render_mode=None,
 points=None, spacing=1.0)
 ```
 
@@ -157,6 +162,9 @@ which is that, too, unless its file says otherwise
 
 `estimator`: from messages to estimates under a network: "ppso" for the paper's observers, "relay" for stamped states
 that are passed on and predicted, or an object of your own. By default the scenario's own, "ppso"
+
+`message_size`: numbers that a policy adds to its agent's messages, the last entries of its action (default 0); needs a
+network
 
 `render_mode`: None (default), "human" or "rgb_array"
 

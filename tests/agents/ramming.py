@@ -24,6 +24,9 @@ class Ramming:
         obstacles: (M, 3) discs x, y, radius.
         radius: of a body.
         model: of all agents.
+        delay: largest age of announced anchors, in control periods; None where nothing is announced. Boxes round
+            estimates are 5 m wider then, so that the announced ones count.
+        younger: ages are observed smaller by this, in s.
     """
 
     agents: int = 4
@@ -33,12 +36,15 @@ class Ramming:
     radius: float = 0.2
     obstacles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     model: AgentModel = field(default_factory=lambda: SingleIntegrator(input_limit=SPEED))
+    delay: int | None = None
+    younger: float = 0.0
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(0)
         angle = 2.0 * math.pi * np.arange(self.agents) / self.agents
         ring = 0.6 / math.sin(math.pi / max(self.agents, 3)) * np.column_stack([np.cos(angle), np.sin(angle)])
         self.x = np.broadcast_to(ring, (self.batch, self.agents, 2)).copy()
+        self.sent = []  # by control period what each agent announced
         self.closest = np.full(self.batch, math.inf)
         self.clearance = np.full(self.batch, math.inf)
 
@@ -57,11 +63,20 @@ class Ramming:
                 fields += [Field(f"{name}.valid", "", 0.0, 1.0)] + [Field(f"{name}.age", "s", 0.0, LIMIT)] * age
                 fields += [Field(f"{name}.position.{axis}", "m", -2 * LIMIT, 2 * LIMIT) for axis in "xy"]
                 fields += [Field(f"{name}.bound.{axis}", "m", 0.0, LIMIT) for axis in axes]
+                fields += [Field(f"{name}.message.{c}", "", -1.0, 1.0) for c in range(self.message_size)]
             layouts[agent] = ObservationLayout(agent, fields, slots)
         models = dict.fromkeys(ids, self.model)
         pushed = {agent: np.full(2, PUSHED) for agent in ids}
-        sizes = dict.fromkeys(ids, 2)
-        return EnvDescription("test_v0", "ring", "estimate", PERIOD, models, layouts, sizes, disturbance=pushed)
+        sizes = dict.fromkeys(ids, 2 + self.message_size)
+        return EnvDescription(
+            "test_v0", "ring", "estimate", PERIOD, models, layouts, sizes,
+            disturbance=pushed, message_size=self.message_size,
+        )  # fmt: skip
+
+    @property
+    def message_size(self):
+        """Of the filter's data."""
+        return 0 if self.delay is None else 4
 
     def observations(self, env):
         """Each pair's error is on a corner of its box, whose size jumps: both sides know differently much."""
@@ -81,8 +96,20 @@ class Ramming:
                 values |= {f"{name}.valid": 1.0, f"{name}.position.x": seen[:, 0], f"{name}.position.y": seen[:, 1]}
                 values |= {f"{name}.bound.{one}": known[:, 0], f"{name}.bound.{two}": known[:, 1]}
                 values |= {f"{name}.age": 0.0} if f"{name}.age" in layout.names else {}
+                if self.delay is not None:
+                    values |= {f"{name}.bound.{axis}": size[:, c] + 5.0 for c, axis in enumerate((one, two))}
+                    values |= self.announced(name, slot.agent)
             found[agent] = layout.build(values)
         return found
+
+    def announced(self, name, other):
+        """What an agent announced some control periods ago, each pair in each world at random."""
+        late = np.minimum(self.rng.integers(0, self.delay + 1, self.batch), len(self.sent) - 1)
+        values = {f"{name}.age": np.maximum(PERIOD * late - self.younger, 0.0)}
+        data = np.zeros((self.batch, 4))
+        if self.sent:
+            data = np.stack(self.sent)[len(self.sent) - 1 - late, range(self.batch), other]
+        return values | {f"{name}.message.{c}": data[:, c] for c in range(4)}
 
     def to_obstacles(self, points):
         """(B, M, 2) from points (B, 2) to the nearest points of the discs."""
@@ -103,7 +130,9 @@ class Ramming:
 
     def move(self, actions) -> None:
         """A period, with a disturbance towards the nearest that turns round halfway in some worlds."""
-        u = self.model.input_limit * np.clip(np.stack(list(actions.values()), axis=1).astype(float), -1.0, 1.0)
+        actions = np.clip(np.stack(list(actions.values()), axis=1).astype(float), -1.0, 1.0)
+        self.sent.append(actions[:, :, 2:])
+        u = self.model.input_limit * actions[:, :, :2]
         push = PUSHED * np.sign(self.wanted())
         turns = self.rng.choice([-1.0, 1.0], (self.batch, 1, 1))
         for part, sign in enumerate((1.0, turns)):
@@ -121,10 +150,11 @@ class Ramming:
 
 
 class Ram:
-    """A policy that knows the truth: for tests only."""
+    """A policy that knows the truth: for tests only. It pauses at random, for 1 s on average, if `pauses`."""
 
-    def __init__(self, world: Ramming) -> None:
-        self.world = world
+    def __init__(self, world: Ramming, pauses: bool = False) -> None:
+        self.world, self.pauses = world, pauses
+        self.rng, self.paused = np.random.default_rng(1), np.zeros((world.batch, world.agents), bool)
 
     def reset(self, env, seeds) -> None:
         """Store the ids."""
@@ -133,6 +163,9 @@ class Ram:
     def act(self, observations):
         """Full inputs at the nearest other."""
         wanted = self.world.wanted()
+        if self.pauses:
+            self.paused ^= self.rng.random(self.paused.shape) < PERIOD
+            wanted = np.where(self.paused[..., None], 0.0, wanted)
         return {agent: wanted[:, i].astype(np.float32) for i, agent in enumerate(self.agents)}
 
 

@@ -7,20 +7,20 @@ import pytest
 
 from agents import SafetyFilter
 from khop_env.env.layout import ObservationLayout
-from khop_env.physics import DriftingIntegrator
+from khop_env.physics import DriftingIntegrator, SingleIntegrator
 from tests.agents.ramming import PERIOD, PUSHED, SPEED, Ram, Ramming
 
 
-def rammed(world, steps=120, margin="certified", gamma=1.0, free=()):
+def rammed(world, steps=120, margin="certified", gamma=1.0, free=(), kind=SafetyFilter):
     """Play the world; agents `free` act without the filter."""
-    env = world.description()
-    policy = SafetyFilter(Ram(world), margin, gamma=gamma)
+    env, announce = world.description(), world.delay is not None
+    policy = kind(Ram(world, pauses=announce), margin, gamma=gamma, announce=announce)
     policy.reset(env, range(world.batch))
     lost = 0
     for _ in range(steps):
         actions = policy.act(world.observations(env))
         for i in free:
-            actions[env.agents[i]] = policy.wanted[env.agents[i]]
+            actions[env.agents[i]][:, :2] = policy.wanted[env.agents[i]]
         world.move(actions)
         lost += sum(int(infeasible.sum()) for infeasible in policy.infeasible.values())
     return lost
@@ -33,6 +33,33 @@ def test_ramming_never_collides_with_errors_on_their_bounds(largest, gamma):
     assert rammed(world, gamma=gamma) == 0
     assert world.closest.min() >= 2.0 * world.radius
     assert world.closest.min() < 2.0 * world.radius + 0.04
+
+
+@pytest.mark.parametrize("delay", [0, 6, 80])
+@pytest.mark.parametrize("model", [SingleIntegrator(input_limit=SPEED), DriftingIntegrator(input_limit=3.0)])
+def test_announced_anchors_never_let_agents_collide(model, delay):
+    """Ages jump from 0 to 4 s, agents pause and say so, and ram each other again; anchors come nearer than without."""
+    world = Ramming(delay=delay, model=model)
+    assert rammed(world, steps=150) == 0
+    assert world.closest.min() >= 2.0 * world.radius
+    assert world.closest.min() < 2.0 * world.radius + 0.12
+
+
+class Forgetful(SafetyFilter):
+    """Doesn't keep the pace that it announced."""
+
+    def act(self, observations):
+        """As if it hadn't announced anything."""
+        self._resting[...] = 0
+        return super().act(observations)
+
+
+@pytest.mark.parametrize(("younger", "kind"), [(PERIOD, SafetyFilter), (0.0, Forgetful)])
+def test_what_is_announced_has_to_be_true(younger, kind):
+    """Ages a period too small, and agents that don't stay at rest, collide."""
+    world = Ramming(delay=6, younger=younger)
+    rammed(world, steps=150, kind=kind)
+    assert (world.closest < 2.0 * world.radius).mean() > 0.1
 
 
 @pytest.mark.parametrize("largest", [0.0, 0.3])
