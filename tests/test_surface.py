@@ -294,7 +294,7 @@ def python(installed):
     return next(folder.glob("[bS]*/python*"))
 
 
-UNUSED = "torch stable_baselines3 numba gymnasium.wrappers hypothesis PIL pydantic pygame rich".split()
+UNUSED = "torch", "stable_baselines3", "numba", "gymnasium.wrappers", "hypothesis", "PIL", "pydantic", "pygame", "rich"
 
 
 def complaints(text, python, folder):
