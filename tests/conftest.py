@@ -103,9 +103,8 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs write an empty figure.png; drawing takes nine tenths of a short run's time, and other tests look at it."""
-    monkeypatch.setattr(
-        "khop_env.results.writing.paper_figure", lambda recording, scenario, path: path.write_bytes(b"")
-    )
+    monkeypatch.setattr("khop_env.results.writing.paper_figure", lambda *drawn: drawn[2].write_bytes(b""))
+    monkeypatch.setattr("khop_env.results.curves.set_iss_figure", lambda *drawn: drawn[2].write_bytes(b""))
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest deselects by markers
