@@ -88,7 +88,8 @@ class Comparison:
     Attributes:
         environment: name of the environment.
         scenario: name of the scenario.
-        planned: number of episodes requested per row; after an interrupt rows may have fewer, or be missing.
+        planned: number of episodes requested per row; after an interrupt rows may have fewer, or be missing. With
+            several workers the missing episodes needn't be the last ones.
         network: over which agents know of each other, in words; None for continuous exchange.
         estimator: its name; None for continuous exchange.
         rows: in the requested order.
@@ -117,11 +118,14 @@ class Comparison:
         return {**where, "task_error_unit": unit, "rows": summaries}
 
     def difference(self, row: Row) -> tuple[float, float | None]:
-        """Mean difference in return from the first row, paired by episode, and half width of its 95 % interval."""
-        first = self.rows[0].episodes.returns
-        paired = min(len(row.episodes.returns), len(first))
-        differences = row.episodes.returns[:paired] - first[:paired]
-        return float(differences.mean()), interval95(differences)
+        """Mean difference in return from the first row, paired by seed, and half width of its 95 % interval.
+
+        After an interrupt only episodes that both rows have count; the difference is nan if there are none.
+        """
+        first = dict(zip(self.rows[0].episodes.seed.tolist(), self.rows[0].episodes.returns, strict=True))
+        played = zip(row.episodes.seed.tolist(), row.episodes.returns, strict=True)
+        differences = np.array([value - first[seed] for seed, value in played if seed in first])
+        return (float(differences.mean()), interval95(differences)) if len(differences) else (math.nan, None)
 
     def frame(self) -> pl.DataFrame:
         """A tidy data frame with one row per policy, observation mode, network and episode."""
@@ -208,9 +212,10 @@ def compare(
     def comparison() -> Comparison:
         result = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds), *over)
         for number, (spec, env, _, network) in enumerate(rows):
-            parts = list(itertools.takewhile(bool, results[number * len(chunks) : (number + 1) * len(chunks)]))
+            played = results[number * len(chunks) : (number + 1) * len(chunks)]
+            parts = [part for part in played if part is not None]  # workers may finish a later chunk first
             if parts:
-                result.rows.append(Row(spec, env, Episodes.joined(parts), network))  # type: ignore[arg-type]
+                result.rows.append(Row(spec, env, Episodes.joined(parts), network))
         return result
 
     try:

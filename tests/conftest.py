@@ -100,6 +100,13 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("quick" if config.option.markexpr == "quick" else "reproducible")
 
 
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs write an empty figure.png; drawing takes nine tenths of a short run's time, and other tests look at it."""
+    monkeypatch.setattr("khop_env.results.writing.paper_figure", lambda *drawn: drawn[2].write_bytes(b""))
+    monkeypatch.setattr("khop_env.results.curves.set_iss_figure", lambda *drawn: drawn[2].write_bytes(b""))
+
+
 @pytest.hookimpl(tryfirst=True)  # before pytest deselects by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     cases: dict[str, list[pytest.Item]] = {}

@@ -8,6 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from khop_env.cli import app
+from khop_env.observers import DesignError
+from khop_env.scenarios import Scenario
 
 
 def khop(*arguments: str, status: int = 0):
@@ -89,6 +91,31 @@ def test_iss(tmp_path):
     assert "analytical gain: for distances up to 0.656 m; it says something of" in table
     assert "and none exceeds it" in table
     assert "slope of log excess with disturbance" in table
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (KeyboardInterrupt(), 130, "khop: interrupted; above are the rows"),
+        (DesignError("it can't be"), 2, "khop: delta(inf) x 10: it can't be; above are the rows"),
+        (ValueError("no such bounds"), 2, "khop: no such bounds; above are the rows"),
+    ],
+    ids=["interrupted", "designed", "bounds"],
+)
+def test_injected_rows_are_kept_when_the_sweep_can_t_begin(monkeypatch, tmp_path, error, status, said):
+    def fail(*_):
+        raise error
+
+    if isinstance(error, DesignError):
+        original = Scenario.build
+        monkeypatch.setattr(Scenario, "build", lambda self, **named: original(self, **named) if named else fail())
+    else:
+        monkeypatch.setattr("agents.set_iss.with_final_bounds", fail)
+    arguments = "iss", "paper", "--episodes", "1", "--duration", "0.2", "--out", str(tmp_path), "--json"
+    result = khop(*arguments, status=status)
+    assert said in result.stderr
+    assert len(json.loads(result.stdout)["injected"]) == 21
+    assert (tmp_path / "injected.csv").exists()
 
 
 def test_tune():

@@ -9,6 +9,8 @@ from test_cli import khop, only_json, refused
 from khop_env.commands.folders import digest, folder_name
 from khop_env.registry import scenario
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 SHORT = ("--duration", "0.05")
 
 

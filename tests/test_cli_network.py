@@ -8,6 +8,8 @@ import polars as pl
 import pytest
 from test_cli import khop, only_json, refused
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 KEYS = [
     *("network", "estimator", "period", "loss", "mean_error", "max_error", "mean_bound", "bound_to_limit"),
     *("violations", "pair_steps", "messages_per_s", "bytes_per_message"),

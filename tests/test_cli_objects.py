@@ -9,6 +9,8 @@ from test_cli import khop, only_json, refused
 from agents import compare
 from khop_env import registry
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 FILE = """
 from dataclasses import dataclass
 
@@ -289,6 +291,9 @@ def test_units_come_from_the_model(folder, monkeypatch):
     from matplotlib.axes import Axes
 
     from khop_env.physics import SingleIntegrator
+    from khop_env.results import paper_figure
+
+    monkeypatch.setattr("khop_env.results.writing.paper_figure", paper_figure)
 
     @dataclass(frozen=True, eq=False)
     class Joint(SingleIntegrator):

@@ -3,6 +3,8 @@
 import pytest
 from test_cli import khop, only_json, refused
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 FILE = """
 import networkx as nx
 import numpy as np

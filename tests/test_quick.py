@@ -32,13 +32,25 @@ def test_all_pairs_of_values_occur_in_few_cases():
     assert len(pairwise([Case()])) == 1  # without parameters
 
 
-def test_every_room_is_in_it_and_no_entry_is_stale():
-    def collected(*options):
-        command = [sys.executable, "-m", "pytest", "--collect-only", "-q", *options]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-        return [line for line in done.stdout.splitlines() if "::" in line]
+COLLECT = """
+import pytest
 
-    every, quick = collected(), collected("-m", "quick")
+class Print:
+    def pytest_collection_finish(self, session):
+        print(*(f"quick {item.nodeid}" for item in session.items), sep="\\n")
+
+    def pytest_deselected(self, items):
+        print(*(f"other {item.nodeid}" for item in items), sep="\\n")
+
+raise SystemExit(pytest.main(["--collect-only", "-qq", "--assert=plain", "-m", "quick"], plugins=[Print()]))
+"""
+
+
+def test_every_room_is_in_it_and_no_entry_is_stale():
+    done = subprocess.run([sys.executable, "-c", COLLECT], cwd=ROOT, capture_output=True, text=True, check=True)
+    named = [line.split(" ", 1) for line in done.stdout.splitlines() if line.startswith(("quick ", "other "))]
+    every, quick = [name for _, name in named], [name for kind, name in named if kind == "quick"]
+    assert len(every) > len(quick) > 0
     assert [entry for entry in SLOW if not any(name.startswith(entry) for name in every)] == []
     assert not any(name.startswith(SLOW) for name in quick)
     rooms = {Path(name.partition("::")[0]).parent for name in every}

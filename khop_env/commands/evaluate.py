@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -163,7 +164,7 @@ def print_comparison(comparison: Comparison) -> None:
             (
                 _name(row, comparison),
                 _with_interval(seen["mean_return"], seen["ci95"]),
-                _with_interval(more, interval, sign="+") if number else "",
+                _with_interval(more, interval, sign="+") if number and not math.isnan(more) else "",
                 f"{seen['final_task_error']:.3g}",
                 "never" if settling is None else f"{settling:.3g}",
                 f"{seen['effort']:.3g}",

@@ -13,6 +13,7 @@ from khop_env.commands.common import (
     INTERRUPTED,
     JsonOption,
     ScenarioArgument,
+    in_words_of_the_file,
     load,
     mistakes,
     print_json,
@@ -63,9 +64,13 @@ def iss(
                 measured["injected"] = injected_errors(scenario, episodes=episodes, seed=seed, progress=progress)
             with Progress("sweeping the bounds") as progress:
                 measured["swept"] = swept_bounds(scenario, episodes=episodes, seed=seed, progress=progress)
-        except (Interrupted, UnfinishedError) as error:
-            unfinished = (str(error), 2) if isinstance(error, UnfinishedError) else ("interrupted", INTERRUPTED)
-            measured["swept" if measured["injected"] else "injected"] = error.partial
+        except (KeyboardInterrupt, UnfinishedError, ValueError) as error:
+            if not measured["injected"] and not isinstance(error, Interrupted):
+                raise
+            interrupted = isinstance(error, KeyboardInterrupt)
+            unfinished = ("interrupted", INTERRUPTED) if interrupted else (in_words_of_the_file(name, str(error)), 2)
+            # the designs before the first swept row may fail, too: the injected rows are kept
+            measured["swept" if measured["injected"] else "injected"] = getattr(error, "partial", [])
         files = {key: folder / f"{key}.csv" for key, rows in measured.items() if rows}
         injected, swept = measured.values()
         with waiting(f"writing {folder}"):
@@ -112,7 +117,7 @@ def iss(
             typer.echo(f"{key}: {path}")
     if unfinished is not None:
         why, status = unfinished
-        say(f"khop: {why}; above are the rows that were measured until then")
+        say(f"khop: {why}; {'above are the rows that were' if injected else 'no row was'} measured until then")
         raise typer.Exit(status)
     if broken:
         raise typer.Exit(1)

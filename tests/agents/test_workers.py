@@ -1,8 +1,10 @@
 """Several processes: they end with the caller, their death is detected, and results until then are kept."""
 
 import contextlib
+import dataclasses
 import io
 import json
+import math
 import multiprocessing
 import os
 import re
@@ -13,14 +15,17 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 from typer.testing import CliRunner
 
-from agents import compare, tune
+from agents import ZeroPolicy, compare, interval95, tune
+from agents.policy import policy_seeds
 from agents.set_iss import injected_errors, swept_bounds
 from agents.workers import Interrupted, UnfinishedError, WorkerError, run_in_processes
 from khop_env.cli import app
+from khop_env.commands.evaluate import print_comparison
 from khop_env.registry import scenario
 from khop_env.scenarios.export import write_scenario
 from tests.env.playing import batched
@@ -138,6 +143,36 @@ def test_what_was_played_is_kept():
     assert isinstance(caught.value, KeyboardInterrupt)
 
 
+class Waiting(ZeroPolicy):
+    """Never begins the episode with seed 0."""
+
+    def reset(self, env, seeds):
+        if policy_seeds([0])[0] in seeds and multiprocessing.parent_process() is not None:
+            time.sleep(600)
+        super().reset(env, seeds)
+
+
+def test_episodes_after_a_missing_one_are_kept(capsys):
+    """A worker may be interrupted in its first episodes when another one has played all that follow."""
+    policies = [f"{__file__}:Waiting", "tanh"]
+    call = {"observe": ["local"], "seeds": range(75), "arguments": {"max_cycles": 4}}
+    waiting, tanh = (row.episodes.returns for row in compare("consensus_v0", policies, **call).rows)
+    with pytest.raises(Interrupted) as caught:
+        compare("consensus_v0", policies, **call, workers=2, progress=interrupting(4))
+    partial = caught.value.partial
+    assert [row.episodes.seed.tolist() for row in partial.rows] == [[*range(25, 75)], [*range(50)]]
+    np.testing.assert_array_equal(partial.rows[0].episodes.returns, waiting[25:])
+    np.testing.assert_array_equal(partial.rows[1].episodes.returns, tanh[:50])
+    more = tanh[25:50] - waiting[25:50]
+    assert partial.difference(partial.rows[1]) == (more.mean(), interval95(more))
+    (other,) = compare("consensus_v0", ["tanh"], **{**call, "seeds": range(25)}).rows
+    assert math.isnan(partial.difference(other)[0])  # no episode was played by both
+    print_comparison(dataclasses.replace(partial, rows=[partial.rows[0], other]))
+    table = capsys.readouterr().out
+    assert "(50 episodes)" in table
+    assert "nan" not in table
+
+
 def test_tuning_and_measuring_keep_what_they_found():
     env = batched("consensus_v0", "paper", num_envs=4, max_cycles=40)
     with pytest.raises(Interrupted) as caught:
@@ -235,7 +270,7 @@ def test_a_killed_worker_on_the_command_line(monkeypatch):
 
     def kill(*_):
         calls.append(None)
-        if len(calls) == 60:  # by then both workers have begun, and the first chunk of episodes has come
+        if len(calls) == 2:
             os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
 
     monkeypatch.setattr("khop_env.commands.evaluate.Progress.__call__", kill)

@@ -38,7 +38,7 @@ def test_what_keeps_the_contract_passes():
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_each_fault_is_caught_by_one_check_alone(fault):
     name, message = FAULTS[fault]
-    report = check_environment(fault)
+    report = check_environment(fault, steps=5 * HORIZON)
     assert not report.ok
     assert statuses(report, "failed") == [name], str(report)
     assert re.search(message, report[name].detail), report[name].detail
