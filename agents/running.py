@@ -80,6 +80,8 @@ class PolicyRun:
         actions: Mapping[str, Any] = self._guarded(self.policy.act, self._observations)
         if correction := getattr(self.policy, "correction", None):  # a filter's, by agent in m/s, for frames
             self.env.batched.world.arrows = ARROW_TIME * np.stack(list(correction.values()))[..., None]
+        if infeasible := getattr(self.policy, "infeasible", None):
+            self.env.batched.world.marked = np.stack(list(infeasible.values()))[:, None]
         self._observations, rewards, *_ = self._guarded(self.env.step, actions)
         self.episode_return += float(np.mean(list(rewards.values())))
         for running, now in zip(self._extremes, self.simulator.extremes, strict=True):

@@ -14,7 +14,7 @@ from khop_env.env.rendering.canvas import Canvas, Window
 from khop_env.env.rendering.estimates import Estimates, default_observer
 from khop_env.env.rendering.links import LinkLines
 from khop_env.env.rendering.looks import PALE, SOFT, angles, headings, looks, sensible, short_names, undirected
-from khop_env.env.rendering.on_map import OnMap
+from khop_env.env.rendering.on_map import Extent, OnMap
 from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import Scene
 from khop_env.env.rendering.trails import Trails
@@ -201,8 +201,9 @@ class Renderer:
         half = self._estimates.half_widths(scene.bounds)
         unbounded = int(np.count_nonzero(~np.isfinite(half).all(axis=1)))
         hidden = self._draw_boxes(canvas, estimated, half)
+        additions = OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius)
         if scene.decorate is not None:
-            scene.decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
+            scene.decorate(additions)
         self._links.draw(canvas, middles, scene)
         for i, j in self._tasks:
             if np.isfinite(middles[[i, j]]).all():
@@ -212,7 +213,7 @@ class Renderer:
         self._draw_labels(canvas, middles, estimate_pixels)
         canvas.clip(None)
         ages = None if scene.messages is None else self._estimates.ages(scene.messages)
-        self._panel.draw(canvas, scene, hidden, unbounded, ages)
+        self._panel.draw(canvas, scene, hidden, unbounded, ages, additions)
         canvas.finish()
         return canvas
 
@@ -223,8 +224,12 @@ class Renderer:
     def _follow(self, positions: FloatArray, estimated: FloatArray, scene: Scene) -> None:
         half = self._estimates.half_widths_in_view(scene.bounds)
         points = np.concatenate([positions, estimated - half, estimated + half])
-        points = points[np.all(np.isfinite(points), axis=1)]
-        self._camera.follow(np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), scene.t - self._drawn)
+        points = np.pad(points, ((0, 0), (0, 2 - points.shape[1])))
+        if scene.decorate is not None:
+            extent = Extent()
+            scene.decorate(extent)
+            points = np.concatenate([points, *map(sensible, extent.points)])
+        self._camera.follow(points[np.all(np.isfinite(points), axis=1)], scene.t - self._drawn)
         self._drawn = scene.t
 
     def _pixels(self, points: FloatArray, agents: IntArray) -> FloatArray:
