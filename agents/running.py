@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +19,7 @@ from khop_env.env import KHopEnv, Settings
 from khop_env.objects import described
 from khop_env.observers import Extremes, FunnelError, SolveError
 from khop_env.registry import Environment, environments, find_task, make
-from khop_env.results.recording import StoppedError
+from khop_env.results.recording import Drawing, StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
 
@@ -66,6 +69,12 @@ class PolicyRun:
     def task_error(self) -> float:
         """Current task error, mean over the agents."""
         return float(self.env.batched.task_errors().mean())
+
+    def drawing(self) -> Drawing:
+        """What the task adds to a frame of the present state, also after later steps."""
+        task, world = copy.copy(self.env.batched.task), self.env.batched.world
+        task.memory = copy.deepcopy(task.memory)
+        return functools.partial(task.draw, world=dataclasses.replace(world, t=world.t.copy(), x=world.x.copy()))
 
     def ended(self) -> bool:
         """Whether the episode is over, at its horizon or because the task ended it."""

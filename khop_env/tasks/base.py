@@ -264,7 +264,7 @@ class Task(abc.ABC):
         }
 
     def draw(self, canvas: MapCanvas, world: World) -> None:  # noqa: B027
-        """Draw on a frame, below the agents; nothing by default. All that is drawn is in view.
+        """Draw on a frame, below the agents; nothing by default. All that is drawn is in view, boxes maybe not.
 
         Args:
             canvas: in metres.

@@ -3,8 +3,9 @@
 import json
 
 import pytest
+from PIL import Image
 
-from benchmarks import safety
+from benchmarks import safety, safety_film
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +55,19 @@ def test_an_interrupt_loses_nothing(counted, monkeypatch, capsys, form):
     else:
         assert "certified bounds: 0 of" in printed
         assert counted[0].condition in " ".join(printed.split())
+
+
+def test_a_film_of_both(tmp_path, monkeypatch):
+    """Side by side until both are over; the agents that collide are counted."""
+    path = tmp_path / "film.gif"
+    monkeypatch.setattr("sys.argv", ["safety_film", str(path), "--scenario", "swap:duration=2.5", "--observer", "7"])
+    counts = []
+    step = safety_film.Half.step
+    monkeypatch.setattr(
+        safety_film.Half, "step", lambda half: (step(half), counts.append((half.title, half.collisions)))
+    )
+    safety_film.main()
+    with Image.open(path) as film:
+        assert film.size == (1036, 480)
+        assert film.n_frames >= 25
+    assert dict(counts) == {"filter on point estimates": 2, "filter on certified bounds": 0}

@@ -47,6 +47,7 @@ class Renderer:
         title: text above the picture.
         error_label: name of the error beside the map.
         error_unit: its unit; by default that of positions.
+        panel: whether there is a strip with time, errors and legend beside the map.
         size: width and height in pixels.
 
     Attributes:
@@ -70,6 +71,7 @@ class Renderer:
         title: str = "",
         error_label: str = "task error",
         error_unit: str | None = None,
+        panel: bool = True,
         size: tuple[int, int] = (900, 720),
     ) -> None:
         fleet, agents = design.fleet, len(design.fleet)
@@ -90,12 +92,12 @@ class Renderer:
         self._thin = self._unit * (0.5 if self._crowded else 1.0)
         self._links = LinkLines(design.links, self._radius, self._thin)
         self._neighbors = frozenset(self._links.pairs)
-        panel = 212 * self._unit
+        strip = (212 if panel else 16) * self._unit
         left, top, bottom = 58 * self._unit, 40 * self._unit, 50 * self._unit
-        self._map = (left, top, size[0] - left - panel, size[1] - top - bottom)
+        self._map = (left, top, size[0] - left - strip, size[1] - top - bottom)
         self._rows = top + self._map[3] * (np.arange(agents) + 0.5) / agents
         self._panel = Panel(
-            (size[0] - panel + 20 * self._unit, top, panel - 36 * self._unit, self._map[3]),
+            (size[0] - strip + 20 * self._unit, top, strip - 36 * self._unit, self._map[3]),
             self._unit,
             {f"{kind}  {self._span(kind)}": look for kind, look in self._looks.items()},
             driven=driven_label if self._driven else None,
@@ -105,7 +107,8 @@ class Renderer:
             error_unit=fleet.position_unit() if error_unit is None else error_unit,
             estimator=estimator,
         )
-        self._network = "" if network is None else described(network)
+        self._with_panel = panel
+        self._network = "" if network is None or not panel else described(network)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
         self._dismissed = False
@@ -212,8 +215,9 @@ class Renderer:
         self._draw_estimates(canvas, scene.estimates, middles, estimate_pixels)
         self._draw_labels(canvas, middles, estimate_pixels)
         canvas.clip(None)
-        ages = None if scene.messages is None else self._estimates.ages(scene.messages)
-        self._panel.draw(canvas, scene, hidden, unbounded, ages, additions)
+        if self._with_panel:
+            ages = None if scene.messages is None else self._estimates.ages(scene.messages)
+            self._panel.draw(canvas, scene, hidden, unbounded, ages, additions)
         canvas.finish()
         return canvas
 
@@ -222,13 +226,15 @@ class Renderer:
         return sensible(x[self._fleet.position_index[:, :2]])
 
     def _follow(self, positions: FloatArray, estimated: FloatArray, scene: Scene) -> None:
-        half = self._estimates.half_widths_in_view(scene.bounds)
-        points = np.concatenate([positions, estimated - half, estimated + half])
-        points = np.pad(points, ((0, 0), (0, 2 - points.shape[1])))
+        extent = Extent()
         if scene.decorate is not None:
-            extent = Extent()
             scene.decorate(extent)
-            points = np.concatenate([points, *map(sensible, extent.points)])
+        boxes = [estimated]
+        if not extent.points:  # otherwise the task says what is to be seen, and the view is steady
+            half = self._estimates.half_widths_in_view(scene.bounds)
+            boxes = [estimated - half, estimated + half]
+        points = np.concatenate([positions, *boxes])
+        points = np.concatenate([np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), *map(sensible, extent.points)])
         self._camera.follow(points[np.all(np.isfinite(points), axis=1)], scene.t - self._drawn)
         self._drawn = scene.t
 
