@@ -47,7 +47,8 @@ class Episodes:
             0 or 1; "arrival_time", mean over the agents in s, nan if not all are at their goals at the end;
             "min_distance" of two agents in m; "deadlock", 1 if not all are at their goals at the end and nobody has
             moved by 0.1 m in the last 2 s; "intervention", mean over agents and time of a filter's changes of
-            their inputs in m/s, nan without a filter. Nothing in other environments.
+            their inputs in m/s, and "infeasible", share of agents and time in which its guarantee had to be begun anew,
+            nan without a filter. Nothing in other environments.
     """
 
     seed: np.ndarray
@@ -203,7 +204,7 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
         bound = np.maximum(bound, np.where(running, infos["max_error_to_bound"].max(axis=1), 0.0))
         error[cycle] = np.where(running, infos["task_error"].mean(axis=1), error[cycle - 1])
         over = terminated | truncated
-        outcomes.add(cycle, running, over, infos, getattr(policy, "intervention", None) or None)
+        outcomes.add(cycle, running, over, infos, policy)
         length[running & over] = cycle
         running &= ~over
         if not running.any():

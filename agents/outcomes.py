@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.policy import Policy
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 
@@ -40,7 +41,7 @@ class Outcomes:
             "min_distance": np.full(batch, math.inf),
             "deadlock": np.zeros(batch),
         }
-        self._changed, self._steps = np.zeros(batch), np.zeros(batch)
+        self._changed, self._infeasible, self._steps = np.zeros(batch), np.zeros(batch), np.zeros(batch)
         self._filtered = False
 
     def add(
@@ -49,7 +50,7 @@ class Outcomes:
         running: NDArray[np.bool_],
         over: NDArray[np.bool_],
         infos: Mapping[str, NDArray[Any]],
-        intervention: Mapping[str, FloatArray] | None,
+        policy: Policy,
     ) -> None:
         """Take account of a control period.
 
@@ -58,7 +59,8 @@ class Outcomes:
             running: (B,) environments whose episode was running until now.
             over: (B,) environments whose episode ends with it.
             infos: after it.
-            intervention: by agent (B,), how much a filter changed the policy's inputs; None without a filter.
+            policy: that acted; a safety filter says by agent (B,) how much it has changed inputs, `intervention`, and
+                where its program was `infeasible`.
         """
         if not self._present:
             return
@@ -67,10 +69,12 @@ class Outcomes:
         values["collision"][running & (infos["cost"] > 0.0).any(axis=1)] = 1.0
         nearest = np.minimum(values["min_distance"], infos["min_distance"].min(axis=1))
         values["min_distance"] = np.where(running, nearest, values["min_distance"])
-        if intervention is not None:
+        if intervention := getattr(policy, "intervention", None):
             self._filtered = True
             self._changed += np.where(running, np.mean(list(intervention.values()), axis=0), 0.0)
             self._steps += running
+        if infeasible := getattr(policy, "infeasible", None):
+            self._infeasible += np.where(running, np.mean(list(infeasible.values()), axis=0), 0.0)
         self._places.append(self._env.world.positions()[self._members])
         ended = running & over
         if not ended.any():
@@ -88,10 +92,10 @@ class Outcomes:
         """(E,) measurements by name; none in an environment without collisions."""
         if not self._present:
             return {}
-        return {
-            **self._values,
-            "intervention": self._changed / self._steps if self._filtered else np.full(len(self._steps), math.nan),
-        }
+        values = {"intervention": self._changed, "infeasible": self._infeasible}
+        nothing = np.full(len(self._steps), math.nan)
+        means = {name: sums / self._steps if self._filtered else nothing for name, sums in values.items()}
+        return {**self._values, **means}
 
 
 def summary(values: Mapping[str, FloatArray]) -> dict[str, Any]:
@@ -112,7 +116,7 @@ def summary(values: Mapping[str, FloatArray]) -> dict[str, Any]:
         "min_distance": float(values["min_distance"].min()),
         "deadlock_rate": float(values["deadlock"].mean()),
         "deadlock_ci95": wilson95(values["deadlock"]),
-        "intervention": float(values["intervention"].mean()) if filtered.all() else None,
+        **{name: float(values[name].mean()) if filtered.all() else None for name in ("intervention", "infeasible")},
     }
 
 

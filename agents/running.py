@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +19,7 @@ from khop_env.env import KHopEnv, Settings
 from khop_env.objects import described
 from khop_env.observers import Extremes, FunnelError, SolveError
 from khop_env.registry import Environment, environments, find_task, make
-from khop_env.results.recording import StoppedError
+from khop_env.results.recording import Drawing, StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
 
@@ -67,6 +70,12 @@ class PolicyRun:
         """Current task error, mean over the agents."""
         return float(self.env.batched.task_errors().mean())
 
+    def drawing(self) -> Drawing:
+        """What the task adds to a frame of the present state, also after later steps."""
+        task, world = copy.copy(self.env.batched.task), self.env.batched.world
+        task.memory = copy.deepcopy(task.memory)
+        return functools.partial(task.draw, world=dataclasses.replace(world, t=world.t.copy(), x=world.x.copy()))
+
     def ended(self) -> bool:
         """Whether the episode is over, at its horizon or because the task ended it."""
         return not self.env.agents
@@ -80,6 +89,8 @@ class PolicyRun:
         actions: Mapping[str, Any] = self._guarded(self.policy.act, self._observations)
         if correction := getattr(self.policy, "correction", None):  # a filter's, by agent in m/s, for frames
             self.env.batched.world.arrows = ARROW_TIME * np.stack(list(correction.values()))[..., None]
+        if infeasible := getattr(self.policy, "infeasible", None):
+            self.env.batched.world.marked = np.stack(list(infeasible.values()))[:, None]
         self._observations, rewards, *_ = self._guarded(self.env.step, actions)
         self.episode_return += float(np.mean(list(rewards.values())))
         for running, now in zip(self._extremes, self.simulator.extremes, strict=True):

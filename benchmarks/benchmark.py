@@ -25,7 +25,8 @@ from benchmarks.comparison import left_out
 from benchmarks.environments import environment_rows
 from benchmarks.networks import network_rows, violation_rows
 from benchmarks.report import Report, reason
-from benchmarks.safety import collision_rows, speed_rows
+from benchmarks.safety import collision_rows
+from benchmarks.safety_speed import speed_rows
 from benchmarks.training import training_rows
 from benchmarks.yardsticks import CompiledPaper, bare_loop
 from khop_env.extras import how_to_install

@@ -1,36 +1,61 @@
-"""The safety filter: time of an agent's move, and collisions under it and without certified bounds."""
+"""Count collisions under the safety filter: swap and crossing, over networks and changing graphs, with adversaries.
+
+python -m benchmarks.safety --episodes 10000         # eight minutes on a core
+"""
 
 from __future__ import annotations
 
-import copy
-import time
-from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import cast
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import NamedTuple
 
-import networkx as nx
 import numpy as np
 
-from agents import SafetyFilter, describe, make_policy
-from agents.policy import EnvDescription, Observations, Policy, by_agent
-from benchmarks.environments import BATCH
+from agents import make_policy, play, shielded
+from agents.policy import EnvDescription, Observations, Policy
 from benchmarks.report import Report
 from khop_env.env import BatchedEnv
 from khop_env.env.layout import Float32Array
-from khop_env.observers import Exponential, FloatArray, TargetObservers
-from khop_env.physics import SingleIntegrator, Sinusoid, paper_tree
-from khop_env.registry import make_batched
-from khop_env.scenarios import Scenario
+from khop_env.network import Network, Outage, RandomLinks, Range, Schedule
+from khop_env.registry import make_batched, scenario
+from khop_env.results.recording import Progress as Fraction
+from khop_env.terminal import Progress, print_table, print_text, say
 
-RADIUS = 0.2  # m, of a body
-MARGINS = ("certified", "none")
-POLICIES = ("tanh", "random", "bang_bang", "ramming")
-NETWORKS = (
-    "lossy:period=0.05,loss=0.3,burst=5",
-    "lossy:period=0.05,loss=0,burst=1",
-    "lossy:period=0.05,loss=0.5,burst=1",
-    "lossy:period=0.05,loss=0.5,burst=20",
-    "lossy:period=0.05,loss=0.1,latency=0.08,jitter=0.06",
+FAMILIES = ("swap", "crossing")
+DURATIONS: Mapping[int, float] = MappingProxyType({8: 15.0, 16: 30.0, 32: 30.0})
+"""Numbers of agents, and the length of their episodes in s."""
+SHARE = 5  # of as many episodes one is played on point estimates, too
+_LEAST = 10  # episodes that make it worth it to build an environment
+_BATCH = 128
+
+
+class Condition(NamedTuple):
+    """How messages get through; a changing graph has three links per agent at most, otherwise it is a tree."""
+
+    network: Network
+    schedule: Schedule | None = None
+
+
+CONDITIONS: Mapping[str, Condition] = MappingProxyType(
+    {
+        "nothing lost": Condition(Network()),
+        "30 % lost": Condition(Network(loss=0.3)),
+        "30 % lost in bursts of 5": Condition(Network(loss=0.3, burst=5.0)),
+        "30 % lost in bursts of 20": Condition(Network(loss=0.3, burst=20.0)),
+        "50 % lost in bursts of 1": Condition(Network(loss=0.5, burst=1.0)),
+        "50 % lost in bursts of 5": Condition(Network(loss=0.5, burst=5.0)),
+        "50 % lost in bursts of 20": Condition(Network(loss=0.5, burst=20.0)),
+        "20 to 140 ms late, 10 % lost": Condition(Network(loss=0.1, latency=0.08, jitter=0.06)),
+        "a random graph per episode": Condition(Network(loss=0.1), RandomLinks((0.5, 1.0))),
+        "links up to 3 m": Condition(Network(loss=0.1), Range(3.0)),
+        "outages of an agent": Condition(
+            Network(loss=0.1), Outage(start=(0.0, 3.0), duration=(1.0, 4.0)) & Outage(start=(3.0, 6.0), duration=2.0)
+        ),
+    }
 )
 
 
@@ -39,138 +64,228 @@ class RammingPolicy:
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Look up the columns of others' positions."""
-        self._columns = {
-            agent: np.stack([layout.columns(f"slot{number}.position") for number in range(len(layout.slots))])
-            for agent, layout in env.layouts.items()
-        }
+        self._ways, self._known = {}, {}
+        for agent, layout in env.layouts.items():
+            slots = range(len(layout.slots))
+            self._ways[agent] = np.stack([layout.columns(f"slot{number}.position") for number in slots])
+            self._known[agent] = np.array([layout.index(f"slot{number}.valid") for number in slots])
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """Actions of which one entry is -1 or 1."""
         actions = {}
         for agent, values in observations.items():
-            ways = values[:, self._columns[agent]]
-            nearest = np.argmin(np.square(ways).sum(axis=2), axis=1)
-            way = np.take_along_axis(ways, nearest[:, None, None], axis=1)[:, 0]
+            ways = values[:, self._ways[agent]]
+            far = np.where(values[:, self._known[agent]] > 0.5, np.square(ways).sum(axis=2), np.inf)
+            way = np.take_along_axis(ways, np.argmin(far, axis=1)[:, None, None], axis=1)[:, 0]
             actions[agent] = way / np.maximum(np.abs(way).max(axis=1, keepdims=True), 1e-9)
         return actions
 
 
-def meeting(agents: int = 8) -> Scenario:
-    """Single integrators on a circle, which all want to be in the same place.
+POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
+    {name: lambda name=name: make_policy(name) for name in ("keep_right", "random", "bang_bang")}
+    | {"ramming": RammingPolicy}
+)
+
+
+class Count(NamedTuple):
+    """Episodes of one policy under one condition.
+
+    Attributes:
+        scenario: its family.
+        agents: their number.
+        condition: one of `CONDITIONS`.
+        policy: inside the filter.
+        margin: of the filter.
+        episodes: played.
+        collisions: of how many of them bodies touched, at any instant, between samples too.
+        min_distance: smallest distance of two agents' centres in m.
+        infeasible: in how many of them an agent's guarantee had to be begun anew.
+    """
+
+    scenario: str
+    agents: int
+    condition: str
+    policy: str
+    margin: str
+    episodes: int
+    collisions: int
+    min_distance: float
+    infeasible: int
+
+
+def collisions(
+    episodes: int,
+    seed: int = 0,
+    *,
+    durations: Mapping[int, float] = DURATIONS,
+    progress: Fraction | None = None,
+) -> Iterator[Count]:
+    """Play episodes with certified bounds, and a fifth of the same episodes on point estimates.
+
+    They are spread evenly over families, numbers of agents, conditions and policies, in random order, so that results
+    until an interrupt cover all; few episodes are spread over some of them.
 
     Args:
-        agents: number of agents; 8 on the paper's tree, others on a random tree.
+        episodes: with certified bounds.
+        seed: of the order, and of the first episode of each combination.
+        durations: numbers of agents, and the length of their episodes in s.
+        progress: called with the completed fraction.
     """
-    angle = 2.0 * np.pi * np.arange(agents) / agents
-    size = max(2.5, agents / 4.0)
-    tree = paper_tree() if agents == 8 else nx.random_labeled_tree(agents, seed=0)
-    return Scenario(
-        name="meeting",
-        description=f"{agents} single integrators on a circle",
-        models=(SingleIntegrator(),) * agents,
-        communication=tree,
-        task=nx.complete_graph(agents),
-        k=nx.diameter(tree),
-        delta=Exponential(1.0, 0.117, 5.0),
-        observers=(TargetObservers(input_observer=False),) * agents,
-        disturbance=Sinusoid(0.1, frequency=(0.5, 2.0)),
-        center=size * np.column_stack([np.cos(angle), np.sin(angle)]).ravel(),
-        radius=0.1,
-    ).sized()
+    kinds = [(family, agents, name) for family in FAMILIES for agents in durations for name in CONDITIONS]
+    order = np.random.default_rng(seed).permutation(len(kinds))[: max(1, episodes // (_LEAST * len(POLICIES)))]
+    cells = [(*kinds[number], policy) for number in order for policy in POLICIES]
+    counts = [episodes // len(cells) + (number < episodes % len(cells)) for number in range(len(cells))]
+    work = np.cumsum([count * durations[cell[1]] * cell[1] for count, cell in zip(counts, cells, strict=True)])
+    made: dict[str, BatchedEnv] = {}
+    before = None
+    for (family, agents, condition, name), count, done in zip(cells, counts, work, strict=True):
+        if (family, agents, condition) != before:
+            made, before = {}, (family, agents, condition)
+        for margin, part in (("certified", count), ("none", -(-count // SHARE))):
+            if not part:
+                continue
+            batch = min(part, _BATCH)
+            if margin not in made or made[margin].num_envs < batch:
+                made[margin] = environment(family, agents, condition, durations[agents], batch)
+            found = play(made[margin], shielded(POLICIES[name](), margin), range(seed, seed + part)).outcomes
+            yield Count(
+                family,
+                agents,
+                condition,
+                name,
+                margin,
+                part,
+                int(found["collision"].sum()),
+                float(found["min_distance"].min()),
+                int((found["infeasible"] > 0.0).sum()),
+            )
+        if progress is not None:
+            progress(float(done / work[-1]))
 
 
-def made(scenario: Scenario, batch: int, network: str, cycles: int = 200) -> BatchedEnv:
-    """The environment in which agents meet."""
+def environment(family: str, agents: int, condition: str, duration: float, num_envs: int) -> BatchedEnv:
+    """The environment of a combination."""
+    network, schedule = CONDITIONS[condition]
+    graph = "tree" if schedule is None else "regular3"
+    chosen = scenario(f"{family}:agents={agents},graph={graph},duration={duration:g}")
     return make_batched(
-        "consensus_v0", scenario, num_envs=batch, network=network, estimator="relay", bounds=True, max_cycles=cycles
+        "navigation_v0", replace(chosen, schedule=schedule), num_envs=num_envs, network=network, bounds=True
     )
 
 
-def speed_rows(report: Report, quick: bool) -> None:
-    """Microseconds per agent and move, apart and in a crowd, without the policy inside.
+def upper_limit(collided: int, episodes: int) -> float:
+    """The rate that is exceeded with a confidence of 5 % (C. Clopper and E. Pearson, Biometrika 26, 1934).
 
     Args:
-        report: takes the rows.
-        quick: as `benchmark`.
+        collided: episodes with a collision.
+        episodes: of how many.
     """
-    for batch, aim in ((1, "at most 20"), (64 if quick else BATCH, "at most 2")):
-        env = made(meeting(), batch, "wifi")
-        policy = SafetyFilter(make_policy("tanh"), radius=RADIUS)
-        policy.reset(describe(env), range(batch))
-        observations, _ = env.reset(0)
-        for place, cycles in (("apart", 10), ("crowd", 100)):  # messages have to arrive first, then agents to meet
-            for _ in range(cycles):
-                actions = policy.act(by_agent(env, observations))
-                observations, *_ = env.step(np.stack(list(actions.values()), axis=1))
-            spent = _microseconds(policy, by_agent(env, observations), quick)
-            report.add(f"filter_{place}_{'single' if batch == 1 else 'batch'}", spent, "us per agent", aim)
+    if collided == 0:
+        return float(1.0 - 0.05 ** (1.0 / episodes))
+    from scipy.stats import beta
+
+    return 1.0 if collided == episodes else float(beta.ppf(0.95, collided + 1, episodes - collided))
+
+
+def summary(counts: Sequence[Count]) -> dict[str, int | float]:
+    """Sums over some counts of one margin, at least one."""
+    episodes, collided = (sum(getattr(each, name) for each in counts) for name in ("episodes", "collisions"))
+    return {
+        "episodes": episodes,
+        "collisions": collided,
+        "upper_limit_95": upper_limit(collided, episodes),
+        "min_distance": min(each.min_distance for each in counts),
+        "infeasible": sum(each.infeasible for each in counts),
+    }
 
 
 def collision_rows(report: Report, quick: bool) -> None:
-    """Episodes in which two bodies touch, at any instant: agents meet, go anywhere at full speed, or ram each other.
+    """Collisions of a thousand episodes, and of the fifth of them that is played on point estimates, too.
 
     Args:
         report: takes the rows.
         quick: as `benchmark`.
     """
-    for margin in MARGINS:
-        sizes, networks = ((8,), NETWORKS[:1]) if quick else ((8, 16, 32), NETWORKS)
-        batch, batches, cycles = (4, 1, 40) if quick else (100, 2 if margin == "certified" else 1, 200)
-        found = [
-            closest(env, name, margin, batch * number, cycles)
-            for agents in sizes
-            for network in networks
-            for env in [made(meeting(agents), batch, network)]
-            for name in POLICIES
-            for number in range(batches)
-        ]
-        least = np.concatenate(found)
-        aims = ("0", f"at least {2.0 * RADIUS:g}") if margin == "certified" else ("", "")
-        collisions = int((least < 2.0 * RADIUS).sum())
-        report.add(f"collisions_{margin}", collisions, f"of {least.size} episodes", aims[0])
-        report.add(f"min_distance_{margin}", float(least.min()), "m", aims[1])
+    counts = list(collisions(20, durations={8: 3.0})) if quick else list(collisions(1000))
+    for margin in ("certified", "none"):
+        found = summary([each for each in counts if each.margin == margin])
+        certified = margin == "certified"
+        report.add(f"collisions_{margin}", found["collisions"], f"of {found['episodes']} episodes", "0" * certified)
+        report.add(f"min_distance_{margin}", found["min_distance"], "m", "at least 0.4" * certified)
 
 
-def closest(env: BatchedEnv, name: str, margin: str, seed: int, cycles: int) -> FloatArray:
-    """(B,) smallest distance of two agents at any instant of an episode, exactly: they move on straight lines.
-
-    Args:
-        env: `made`, whose control period is the network's.
-        name: of the policy inside the filter.
-        margin: of the filter.
-        seed: of the first episode.
-        cycles: control periods.
-    """
-    policy = SafetyFilter(RammingPolicy() if name == "ramming" else make_policy(name), margin, radius=RADIUS)
-    batch, agents = env.num_envs, len(env.agents)
-    policy.reset(describe(env), range(seed, seed + batch))
-    observations, _ = env.reset(seed)
-    i, j = np.triu_indices(agents, 1)
-    least = np.full(batch, np.inf)
-    for _ in range(cycles):
-        before = env.simulator.x.reshape(batch, agents, 2).copy()
-        actions = policy.act(by_agent(env, observations))
-        observations, *_ = env.step(np.stack(list(actions.values()), axis=1))
-        start = before[:, i] - before[:, j]
-        along = (
-            env.simulator.x.reshape(batch, agents, 2)[:, i] - env.simulator.x.reshape(batch, agents, 2)[:, j] - start
-        )
-        length = np.maximum((along**2).sum(axis=2), 1e-300)
-        share = np.clip(-(start * along).sum(axis=2) / length, 0.0, 1.0)
-        least = np.minimum(least, np.linalg.norm(start + share[..., None] * along, axis=2).min(axis=1))
-    return least
+def print_counts(counts: Sequence[Count]) -> None:
+    """A table by condition, by scenario and by policy, and the totals."""
+    groups: Sequence[tuple[Sequence[str], Callable[[Count], str]]] = (
+        (list(CONDITIONS), lambda each: each.condition),
+        ([_scenario(family, agents) for family in FAMILIES for agents in DURATIONS], _scenario_of),
+        (list(POLICIES), lambda each: each.policy),
+    )
+    rows: list[tuple[str, ...]] = []
+    for names, key in groups:
+        rows += [("",) * 6] * bool(rows)
+        for name in names:
+            if chosen := [each for each in counts if key(each) == name]:
+                rows.append((name, *_cells(chosen)))
+    header = ("condition", "episodes", "collided", "distance", "infeasible", "on point estimates")
+    print_table(header, rows, "Episodes in the certified filter, by condition, by scenario, and by policy inside")
+    for margin, text in (("certified", "certified bounds"), ("none", "point estimates, on the same episodes")):
+        if some := [each for each in counts if each.margin == margin]:
+            found = summary(some)
+            print_text(
+                f"{text}: {found['collisions']} of {found['episodes']} episodes with a collision, a rate below "
+                f"{found['upper_limit_95']:.2g} with 95 % confidence; smallest distance {found['min_distance']:.4f} m, "
+                f"bodies touch at 0.4 m; {found['infeasible']} episodes in which a guarantee had to be begun anew"
+            )
 
 
-def _microseconds(policy: SafetyFilter, observations: Observations, quick: bool) -> float:
-    """Per agent and move, the best of some, less the policy inside; anchors stay where they are."""
-    kept = copy.deepcopy(policy)
-    wanted = kept.policy.act(observations)
-    kept.policy = cast(Policy, SimpleNamespace(act=lambda observations: wanted))
-    agents = sum(values.shape[0] for values in observations.values())
-    best = np.inf
-    for _ in range(3 if quick else 50):
-        repeated = copy.deepcopy(kept)
-        begin = time.perf_counter()
-        repeated.act(observations)
-        best = min(best, time.perf_counter() - begin)
-    return best / agents * 1e6
+def _scenario(family: str, agents: int) -> str:
+    return f"{family}:agents={agents}"
+
+
+def _scenario_of(count: Count) -> str:
+    return _scenario(count.scenario, count.agents)
+
+
+def _cells(counts: Sequence[Count]) -> tuple[str, ...]:
+    margins = [[each for each in counts if each.margin == margin] for margin in ("certified", "none")]
+    certified, estimated = (summary(some) if some else None for some in margins)
+    assert certified is not None
+    cells = (str(certified["episodes"]), str(certified["collisions"]), f"{certified['min_distance']:.4f} m")
+    points = "" if estimated is None else f"{estimated['collisions']} of {estimated['episodes']}"
+    return (*cells, str(certified["infeasible"]), points)
+
+
+def main() -> None:
+    """Print the counts; after an interrupt those until then."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--episodes", type=int, default=1000, help="with certified bounds; 1000 by default")
+    parser.add_argument("--seed", type=int, default=0, help="of the first episode")
+    parser.add_argument("--json", action="store_true", help="print one JSON object with every count")
+    chosen = parser.parse_args()
+    if chosen.episodes < 1 or chosen.seed < 0:
+        parser.error("--episodes must be at least 1, and --seed at least 0")
+    counts: list[Count] = []
+    interrupted = False
+    try:
+        with Progress("counting collisions") as progress:
+            for each in collisions(chosen.episodes, chosen.seed, progress=progress):
+                counts.append(each)
+    except KeyboardInterrupt:
+        interrupted = True
+    if chosen.json:
+        totals = {
+            margin: summary(some)
+            for margin in ("certified", "none")
+            if (some := [each for each in counts if each.margin == margin])
+        }
+        print(json.dumps({"interrupted": interrupted, "totals": totals, "rows": [each._asdict() for each in counts]}))
+    elif counts:
+        print_counts(counts)
+    if interrupted:
+        say(f"interrupted after {sum(each.episodes for each in counts)} episodes")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

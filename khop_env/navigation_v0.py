@@ -127,7 +127,8 @@ Initial states, goals and disturbances are drawn per episode from the seed; `res
 `set_state()` save and restore everything, and a pickled or deep-copied environment continues bit for bit.
 
 Frames show agents as discs, red where they have collided, their goals and obstacles. `env.batched.world.arrows`,
-(agents, axes, 1) in m, are drawn from each agent: for what a filter changes.
+(agents, axes, 1) in m, are drawn from each agent, for what a filter changes; agents of `world.marked`, (agents, 1), are
+in a ring, for where its program is infeasible.
 
 ### Arguments
 

@@ -190,7 +190,7 @@ def print_comparison(comparison: Comparison) -> None:
 
 def _print_outcomes(comparison: Comparison, title: str) -> None:
     """The table of an environment in which agents may collide."""
-    rows = []
+    rows, began_anew = [], any(row.summary()["infeasible"] for row in comparison.rows)
     for row in comparison.rows:
         seen = row.summary()
         filtered, time = seen["intervention"], seen["arrival_time"]
@@ -201,18 +201,21 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
                 "" if time is None else f"{time:.3g}",
                 f"{seen['min_distance']:.3f}",
                 "" if filtered is None else f"{filtered:.3f}",
+                *["" if filtered is None else f"{100.0 * seen['infeasible']:.2g}"] * began_anew,
                 _with_interval(seen["mean_return"], seen["ci95"]),
                 f"{seen['max_error_to_bound']:.3f}",
             )
         )
-    header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)", "return")
-    print_table((*header, "e / bound"), rows, title)
+    header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)")
+    print_table((*header, *["infeasible %"] * began_anew, "return", "e / bound"), rows, title)
+    infeasible = "infeasible: share of agents and time in which a filter's guarantee had to be begun anew; "
     print_text(
         "collided: episodes with a collision; success: all at their goals at the end, without any collision; deadlock: "
         "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals. "
         "time: until an agent's first arrival, mean over agents and successful episodes; distance: smallest of two "
-        "agents' centres; changed: by a filter, of each agent's inputs, mean over time; return: mean over agents of an "
-        "episode's sum, 95 % interval; e / bound: largest estimation error over its bound (below 1 by guarantee)"
+        "agents' centres; changed: by a filter, of each agent's inputs, mean over time; "
+        f"{infeasible if began_anew else ''}return: mean over agents of an episode's sum, 95 % interval; e / bound: "
+        "largest estimation error over its bound (below 1 by guarantee)"
     )
 
 

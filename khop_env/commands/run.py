@@ -148,6 +148,7 @@ def run(
             episode.dt,
             task_error=None if played is None else played.task_error,
             ended=None if played is None else played.ended,
+            drawing=None if played is None or video is None else played.drawing,
             progress=progress,
         )
     summary = summarize(

@@ -15,6 +15,10 @@ from khop_env.physics import Fleet
 from khop_env.results.records import MessageRecord, ObserverRecord
 from khop_env.scenarios.scenario import number_of_steps
 from khop_env.simulation import Simulator
+from khop_env.tasks import MapCanvas
+
+Drawing = Callable[[MapCanvas], None]
+"""Draws on a frame."""
 
 Progress = Callable[[float], None]
 """Called repeatedly with the completed fraction, from 0 to 1."""
@@ -47,6 +51,7 @@ class Recording:
         wall_time: seconds of stepping and sampling, without compilation.
         error: the exception that ended the episode early, or None; samples until then are kept.
         task_error: (T,) mean task error of the team; None without an environment's task.
+        drawings: (T,) what an environment's task adds to a frame of each sample; None if that wasn't recorded.
     """
 
     design: ObserverDesign
@@ -59,6 +64,7 @@ class Recording:
     wall_time: float
     error: Failure | None = None
     task_error: FloatArray | None = None
+    drawings: tuple[Drawing, ...] | None = None
 
     def __repr__(self) -> str:
         samples = f"{len(self.time)} samples of {self.steps} steps to t = {self.time[-1]:g} s"
@@ -88,6 +94,7 @@ def record(
     samples_per_second: float = 100.0,
     task_error: Callable[[], float] | None = None,
     ended: Callable[[], bool] | None = None,
+    drawing: Callable[[], Drawing] | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Run the simulator from its current time to `duration`, and record samples.
@@ -102,6 +109,7 @@ def record(
             `MOST_ROWS` numbers.
         task_error: returns the current error of the environment's task, to be sampled; or None.
         ended: returns whether the episode is over before its time; called after every step.
+        drawing: returns what the environment's task adds to a frame at present, for films; or None.
         progress: called repeatedly with the completed fraction.
 
     Returns:
@@ -120,7 +128,7 @@ def record(
     width = max(1, simulator.observers.layout.size, design.inputs.layout.size)
     most_samples = max(2, MOST_ROWS // width)
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
-    samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error)
+    samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error, drawing)
     error: Failure | None = None
     with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError and the summary do
         simulator.warm_up()
@@ -153,8 +161,15 @@ def record(
 class _Samples:
     """Arrays for all samples of an episode."""
 
-    def __init__(self, simulator: Simulator, count: int, task_error: Callable[[], float] | None) -> None:
-        self._simulator = simulator
+    def __init__(
+        self,
+        simulator: Simulator,
+        count: int,
+        task_error: Callable[[], float] | None,
+        drawing: Callable[[], Drawing] | None,
+    ) -> None:
+        self._simulator, self._drawing = simulator, drawing
+        self._drawings: list[Drawing] = []
         self._sources: dict[str, Callable[[], FloatArray]] = {
             "time": lambda: simulator.t,
             "x": lambda: simulator.x[0],
@@ -185,6 +200,8 @@ class _Samples:
     def take(self) -> None:
         for name, read in self._sources.items():
             self._arrays[name][self._taken] = read()
+        if self._drawing is not None:
+            self._drawings.append(self._drawing())
         self._taken += 1
 
     def recording(self, steps: int, wall_time: float, error: Failure | None) -> Recording:
@@ -226,4 +243,5 @@ class _Samples:
             wall_time=wall_time,
             error=error,
             task_error=kept["task_error"][:, 0] if "task_error" in kept else None,
+            drawings=None if self._drawing is None else tuple(self._drawings),
         )

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import functools
 import importlib.util
 import itertools
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,8 +73,8 @@ def write_video(
         path: path of the file; .mp4 (H.264) or .gif (in a loop; its times are rounded to 10 ms).
         observer: id or index of the agent whose estimates are drawn; by default the agent with most task edges to
             agents that aren't its neighbours.
-        env: the environment of the run, for its task and the mean of its task error; None for agreement along the
-            scenario's task graph, with the consensus error |Pi p|.
+        env: the environment of the run, for its task's edges and the mean of its task error; None for agreement along
+            the scenario's task graph, with the consensus error |Pi p|. What else the task draws is in the recording.
         fps: frames per second, up to 50.
         speed: simulated seconds per second of the film.
         progress: called with the completed fraction.
@@ -115,11 +113,28 @@ def write_video(
         title = f"{env.task.name} on {scenario.name}"
         renderer = Renderer.of(env.task, env.world, env.simulator.observers, observer=index, title=title, size=size)
     samples = _samples(recording, fps / speed)
-    frames = _frames(renderer, recording, env, samples, progress)
+    frames = _frames(renderer, recording, samples, progress)
+    ends = samples[0], samples[len(samples) // 2], samples[-1]
+    return write_frames(frames, path, fps, lambda: [*_frames(renderer, recording, ends)])
+
+
+def write_frames(
+    frames: Iterator[NDArray[np.uint8]], path: Path, fps: int, typical: Callable[[], Sequence[NDArray[np.uint8]]]
+) -> Path:
+    """Write pictures as a film.
+
+    Args:
+        frames: (H, W, 3) each.
+        path: of the file, .mp4 or .gif.
+        fps: frames per second.
+        typical: returns some of them, which have all colours; for .gif.
+
+    Raises:
+        OSError: if the file can't be written; no partial file is left.
+    """
     try:
         if path.suffix.lower() == ".gif":
-            first, middle, last = samples[0], samples[len(samples) // 2], samples[-1]
-            _write_gif(path, frames, fps, np.vstack([*_frames(renderer, recording, env, [first, middle, last])]))
+            _write_gif(path, frames, fps, np.vstack([*typical()]))
         else:
             _write_mp4(path, frames, fps)
     except BaseException:
@@ -141,7 +156,6 @@ def _samples(recording: Recording, per_second: float) -> list[int]:
 def _frames(
     renderer: Renderer,
     recording: Recording,
-    env: BatchedEnv | None,
     samples: Sequence[int],
     progress: Progress | None = None,
 ) -> Iterator[NDArray[np.uint8]]:
@@ -152,10 +166,7 @@ def _frames(
     for number, k in enumerate(samples):
         time, x, errors = float(recording.time[k]), recording.x[k], recording.task_error
         error = float(consensus_error(recording.fleet, x)) if errors is None else float(errors[k])
-        decorate = None
-        if env is not None:
-            world = dataclasses.replace(env.world, t=recording.time[[k]], x=x[:, None])
-            decorate = functools.partial(env.task.draw, world=world)
+        decorate = None if recording.drawings is None else recording.drawings[k]
         if isinstance(states, MessageRecord):
             messages, largest = Messages(states.age[k], states.missed[k]), _largest_share(states, k)
         else:

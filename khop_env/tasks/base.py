@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -41,6 +41,7 @@ class World:
         inputs: (m, B) inputs in force, as fractions of their limits.
         initial: where states start, with the scenario's arena if it has one.
         arrows: (N, d, B) in m, drawn from each agent in frames; None for none. Whoever changes actions may set it.
+        marked: (N, B) agents that are to stand out in frames; None for none. Set like `arrows`.
     """
 
     design: ObserverDesign
@@ -53,6 +54,7 @@ class World:
     inputs: FloatArray
     initial: InitialSet | None = None
     arrows: FloatArray | None = None
+    marked: NDArray[np.bool_] | None = None
 
     __repr__ = brief
 
@@ -102,7 +104,13 @@ class Column:
 
 
 class MapCanvas(Protocol):
-    """Draws on the map of a frame, in metres; colours are "#RRGGBB"."""
+    """Draws on the map of a frame, in metres; colours are "#RRGGBB".
+
+    Attributes:
+        marker: radius of an agent's marker in m.
+    """
+
+    marker: float
 
     def circle(self, center: FloatArray, radius: float, color: str, *, filled: bool = False) -> None:
         """A circle about `center` (2,) with `radius` in m and a `color`; its inside, too, if `filled`."""
@@ -114,6 +122,10 @@ class MapCanvas(Protocol):
 
     def cross(self, center: FloatArray, color: str) -> None:
         """A cross at `center` (2,) of a `color`, as large as an agent's marker."""
+        ...
+
+    def legend(self, text: str, symbol: Callable[[MapCanvas], None]) -> None:
+        """A line of the legend, with a `symbol` that is drawn within +-1 m."""
         ...
 
 
@@ -252,7 +264,7 @@ class Task(abc.ABC):
         }
 
     def draw(self, canvas: MapCanvas, world: World) -> None:  # noqa: B027
-        """Draw on a frame, below the agents; nothing by default.
+        """Draw on a frame, below the agents; nothing by default. All that is drawn is in view, boxes maybe not.
 
         Args:
             canvas: in metres.

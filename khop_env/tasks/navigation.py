@@ -17,7 +17,10 @@ from khop_env.tasks.edges import NUMBER, Reward, axis_names, require_positive
 from khop_env.tasks.motion import add_squares, lower_distances
 
 MOST_OBSTACLES = 3  # in an observation
-DISC, COLLIDED, GOAL, OBSTACLE, ARROW = "#8899aa", "#cc3311", "#666666", "#999999", "#ee7733"
+START = np.array([0.8, 0.5])  # of an arrow in the legend
+RING = np.column_stack([np.cos(np.linspace(0.0, 2.0 * np.pi, 49)), np.sin(np.linspace(0.0, 2.0 * np.pi, 49))])
+DISC, COLLIDED, OBSTACLE, ARROW, MARKED = "#8899aa", "#cc3311", "#999999", "#ee7733", "#aa3377"
+GOAL, TO_GOAL = "#228833", "#99ccaa"
 
 
 class NavigationArguments(TypedDict, total=False):
@@ -203,7 +206,7 @@ class Navigation(Task):
         }
 
     def draw(self, canvas: MapCanvas, world: World) -> None:
-        """Obstacles, goals, agents as discs, red where they collide, and `World.arrows`."""
+        """Obstacles, goals, agents as discs, red where they collide, `World.arrows`, and rings where `World.marked`."""
         memory, radius = self.memory, self.arena.radius
         positions = _in_plane(world.positions()[..., 0])
         for x1, y1, x2, y2, thick in self._obstacles:
@@ -215,13 +218,23 @@ class Navigation(Task):
             for end in ends if thick else ():
                 canvas.circle(end, thick, OBSTACLE, filled=True)
         collided = (memory["nearest"][:, 0] < 2.0 * radius) | (memory["clearance"][:, 0] < radius)
-        for own, goal, hit in zip(positions, _in_plane(memory["goal"][..., 0]), collided, strict=True):
+        marked = np.zeros(len(positions), bool) if world.marked is None else world.marked[:, 0]
+        for own, goal, hit, mark in zip(positions, _in_plane(memory["goal"][..., 0]), collided, marked, strict=True):
             canvas.circle(goal, self.goal_radius, GOAL)
-            canvas.line(np.array([own, goal]), GOAL, 0.5)
-            canvas.circle(own, radius, COLLIDED if hit else DISC, filled=bool(hit))
+            canvas.line(np.array([own, goal]), TO_GOAL, 0.5)
+            visible = max(radius, 1.6 * canvas.marker) if hit or mark else radius
+            _disc(canvas, own, visible, bool(hit), bool(mark))
+        canvas.legend("body of an agent", lambda symbol: _disc(symbol, np.zeros(2), 0.7, False, False))
+        canvas.legend("in a collision", lambda symbol: _disc(symbol, np.zeros(2), 0.7, True, False))
+        canvas.legend("goal", lambda symbol: symbol.circle(np.zeros(2), 0.7, GOAL))
+        if len(self._obstacles):
+            canvas.legend("obstacle", lambda symbol: symbol.circle(np.zeros(2), 0.5, OBSTACLE, filled=True))
+        if world.marked is not None:
+            canvas.legend("filter infeasible", lambda symbol: _disc(symbol, np.zeros(2), 0.7, False, True))
         if world.arrows is not None:
             for own, arrow in zip(positions, _in_plane(world.arrows[..., 0]), strict=True):
                 _arrow(canvas, own, arrow)
+            canvas.legend("change by a filter", lambda symbol: _arrow(symbol, -START, 2.0 * START))
 
 
 def _default_arena(center: FloatArray, radius: FloatArray, agents: int) -> Arena:
@@ -234,6 +247,13 @@ def _default_arena(center: FloatArray, radius: FloatArray, agents: int) -> Arena
 def _in_plane(points: FloatArray) -> FloatArray:
     """(N, 2) as frames show positions: on a line, or from above."""
     return points[:, :2] if points.shape[1] > 1 else np.pad(points, ((0, 0), (0, 1)))
+
+
+def _disc(canvas: MapCanvas, center: FloatArray, radius: float, hit: bool, mark: bool) -> None:
+    """An agent's body; in a ring if it is marked."""
+    canvas.circle(center, radius, COLLIDED if hit else DISC, filled=hit)
+    if mark:
+        canvas.line(center + 1.25 * radius * RING, MARKED, 3.0)
 
 
 def _arrow(canvas: MapCanvas, start: FloatArray, arrow: FloatArray) -> None:

@@ -16,10 +16,10 @@ from khop_env.cli import app
 
 
 class Slowed:
-    """Towards the goal at a third of the speed, by something that changes what another policy wants."""
+    """Towards the goal at a third of the speed, by something that changes what another policy wants, and isn't sure."""
 
     def __init__(self):
-        self._policy, self.intervention = make_policy("go_to_goal"), {}
+        self._policy, self.intervention, self.infeasible = make_policy("go_to_goal"), {}, {}
 
     def reset(self, env, seeds):
         self._policy.reset(env, seeds)
@@ -28,6 +28,7 @@ class Slowed:
         wanted = self._policy.act(observations)
         actions = {agent: action / np.float32(3.0) for agent, action in wanted.items()}
         self.intervention = {agent: np.linalg.norm(wanted[agent] - actions[agent], axis=-1) for agent in wanted}
+        self.infeasible = {agent: wanted[agent][..., 0] > 0.5 for agent in wanted}
         return actions
 
 
@@ -41,10 +42,11 @@ def test_outcomes_measured_by_hand(name, make):
         policy = make()
         policy.reset(describe(env), policy_seeds([seed]))
         observations, _ = env.reset(seed=seed)
-        first, distance, cost, changed, cycle = {}, math.inf, 0.0, [], 0
+        first, distance, cost, changed, unsure, cycle = {}, math.inf, 0.0, [], [], 0
         while env.agents:
             actions = policy.act(observations)
             changed.append(np.mean(list(policy.intervention.values())))
+            unsure.append(np.mean(list(policy.infeasible.values())))
             observations, _, _, _, infos = env.step(actions)
             cycle += 1
             distance = min([distance, *(info["min_distance"] for info in infos.values())])
@@ -57,10 +59,12 @@ def test_outcomes_measured_by_hand(name, make):
         assert found["success"][seed] == (there and cost == 0.0)
         assert found["min_distance"][seed] == pytest.approx(distance, rel=1e-12)
         assert found["intervention"][seed] == pytest.approx(np.mean(changed), rel=1e-6)
+        assert found["infeasible"][seed] == pytest.approx(np.mean(unsure), rel=1e-6)
         expected = np.mean(list(first.values())) if there else math.nan
         np.testing.assert_allclose(found["arrival_time"][seed], expected)
         assert found["deadlock"][seed] == 0.0
     assert found["collision"].any()
+    assert 0.0 < found["infeasible"].max() < 1.0
     assert name.startswith("swap") or found["success"].any()
 
 
@@ -81,7 +85,7 @@ def test_rates_and_times_of_a_row():
     assert row["success_rate"] == outcomes["success"].mean() == pytest.approx(1.0 - row["collision_rate"])
     assert row["arrival_time"] == outcomes["arrival_time"][outcomes["success"] == 1.0].mean()
     assert row["min_distance"] == outcomes["min_distance"].min() < 0.4
-    assert row["intervention"] is None
+    assert (row["intervention"], row["infeasible"]) == (None, None)
     assert idle["arrival_time"] is None
     assert table.frame()["collision"].sum() == outcomes["collision"].sum()
     assert compare("consensus_v0", ["zero"], seeds=range(2)).rows[0].episodes.outcomes == {}
@@ -123,7 +127,7 @@ def test_the_command_prints_rates_and_networks():
         for network in ("ideal", "lossy:loss=0.3,burst=5")
     ]
     measured = {"collision_rate", "success_rate", "arrival_time", "min_distance", "deadlock_rate", "intervention"}
-    assert measured < set(rows[0])
+    assert measured | {"infeasible"} < set(rows[0])
     table = khop("--policies", "zero", "--env", "max_cycles=20").stdout
     assert "navigation_v0 on crossing over a network (a message every 50 ms" in table
     assert "collided" in table
@@ -131,3 +135,7 @@ def test_the_command_prints_rates_and_networks():
     refused = khop("--network", "ideal", "--env", "network=wifi")
     assert refused.exit_code == 2
     assert "--env network and --network: choose one of them" in refused.output
+    assert "infeasible" not in table  # without a filter, or if it never was
+    unsure = khop("--policies", f"zero,{__file__}:Slowed", "--env", "max_cycles=20").stdout
+    assert "infeasible: share of agents and time" in " ".join(unsure.split())
+    assert unsure.count("infeasible") == 2  # in the header, too

@@ -221,6 +221,16 @@ class TestWhoIsShown:
         assert short_names(Fleet([DoubleIntegrator(), Cargo()])) == ["cart0", "carg0"]
 
 
+class TestWithoutThePanel:
+    def test_the_map_has_its_room(self):
+        """And nothing of it is drawn: right of the map all is white."""
+        whole, alone = renderer(size=(900, 720)), renderer(size=(900, 720), panel=False)
+        assert (whole.frame(scene())[60:, 705:] != 255).any()
+        frame = alone.frame(scene())
+        assert (frame[:, 886:] == 255).all()
+        assert (frame[300, 880:886].min(axis=1) < 200).any()  # the edge of the map
+
+
 class TestAsAnObject:
     @pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
     def test_copies_go_on_alike(self, copied):

@@ -9,6 +9,9 @@ import pytest
 from PIL import Image
 
 from agents import make_law
+from agents.running import policy_run
+from khop_env.env.rendering.on_map import Extent
+from khop_env.registry import scenario as load
 from khop_env.results import record, video
 from khop_env.results.video import require_video, write_video
 from khop_env.scenarios import mixed_fleet, paper
@@ -150,3 +153,39 @@ def test_progress_is_told(run, tmp_path):
     write_video(*run, tmp_path / "film.gif", progress=fractions.append)
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
+
+
+def test_a_film_shows_what_the_task_draws_at_that_time(tmp_path, monkeypatch):
+    """Collisions, goals and a filter's arrows of every frame, and not those of the end."""
+    from khop_env.env.rendering import Renderer
+
+    class Noted(Extent):
+        def circle(self, center, radius, color, *, filled=False):
+            self.points.append((*np.round(center, 9), radius, color, filled))
+
+        def line(self, points, color, width=2.0):
+            self.points.append((*np.round(points, 9).ravel(), color, width))
+
+    def drawn(draw):
+        noted = Noted()
+        draw(noted)
+        return noted.points
+
+    def played():
+        return policy_run("filter:margin=none", scenario, "estimate", None, 23, environment="navigation_v0")
+
+    scenes, frame = [], Renderer.frame
+    monkeypatch.setattr(Renderer, "frame", lambda self, scene: (scenes.append(scene), frame(self, scene))[1])
+    scenario = load("swap:duration=2.2")
+    run = played()
+    recording = record(run, run.duration, 0.05, drawing=run.drawing)
+    write_video(recording, scenario, tmp_path / "film.mp4", env=run.env.batched, fps=10)
+    again, hits = played(), []
+    assert len(scenes) == 22
+    for scene in scenes:
+        while float(again.simulator.t[0]) < scene.t - 1e-9:
+            again.step(0.05)
+        assert drawn(scene.decorate) == drawn(again.drawing())
+        hits.append(sum(filled for *_, filled in drawn(scene.decorate) if filled is True))
+    assert hits[0] == 0
+    assert max(hits) > 0

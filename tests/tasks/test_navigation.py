@@ -299,24 +299,50 @@ def test_episodes_last_as_long_as_the_scenario():
     assert make_batched("consensus_v0", "mixed_fleet", max_cycles=None).settings.horizon == 600
 
 
-def test_frames_show_discs_goals_collisions_and_arrows():
+def test_frames_show_discs_goals_collisions_arrows_and_marks():
+    """And say in a legend what they are."""
     env = navigation_v0.parallel_env("swap", render_mode="rgb_array")
     policy = make_policy("go_to_goal")
     policy.reset(describe(env), [0])
     observations, infos = env.reset(seed=1)
+    world = env.batched.world
     frames = [env.render()]
-    env.batched.world.arrows = np.ones((8, 2, 1))
+    world.arrows = np.full((8, 2, 1), 0.5)
     frames.append(env.render())
-    env.batched.world.arrows = None
+    world.arrows, world.marked = None, np.arange(8)[:, None] == 3
+    frames.append(env.render())
+    world.marked = None
     while not any(info["cost"] for info in infos.values()):
         actions = policy.act(observations)
         observations, _, _, _, infos = env.step(actions)
     frames.append(env.render())
-    red = [int((np.abs(frame.astype(int) - [204, 51, 17]).sum(axis=2) < 30).sum()) for frame in frames]
-    assert (frames[0] != frames[1]).any(axis=-1).sum() > 200
-    assert red[0] < 50
-    assert red[1] < 50
-    assert red[2] > 500
+    colors = {"hit": (204, 51, 17), "arrow": (238, 119, 51), "mark": (170, 51, 119), "goal": (34, 136, 51)}
+    found = [
+        {name: (np.abs(frame.astype(int) - color).sum(axis=2) < 30) for name, color in colors.items()}
+        for frame in frames
+    ]
+    legend = slice(700, None)
+    assert [int(each["hit"][:, legend].sum()) > 50 for each in found] == [True] * 4
+    assert [int(each["hit"][:, :700].sum()) > 400 for each in found] == [False, False, False, True]
+    for name, expected in (("arrow", [False, True, False, False]), ("mark", [False, False, True, False])):
+        for part in (slice(700), legend):
+            assert [int(each[name][:, part].sum()) > 10 for each in found] == expected
+    rows, columns = np.nonzero(found[0]["goal"][:, :700])  # all goals are in view
+    assert len(rows) > 8 * 30
+    assert min(columns) > 60
+    assert max(columns) < 690
+    assert min(rows) > 42
+
+
+def test_obstacles_are_in_view_and_in_the_legend():
+    """Also where nobody is near them."""
+    frame = navigation_v0.parallel_env("corridor", render_mode="rgb_array")
+    frame.reset(seed=0)
+    grey = np.abs(frame.render().astype(int) - 153).sum(axis=2) < 9
+    assert grey[:, 700:].sum() > 30
+    columns = np.nonzero(grey[:, 60:690].sum(axis=0) > 100)[0]  # ends of both rooms
+    assert len(columns) > 2
+    assert columns[-1] - columns[0] > 400
 
 
 # -- arguments and files -------------------------------------------------------------------------------------------

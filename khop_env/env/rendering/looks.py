@@ -21,6 +21,8 @@ INK, SOFT, PALE = "#222222", "#666666", "#ECECEC"
 
 TRAIL = 2.0  # s
 
+CIRCLE = np.stack([np.cos(np.arange(48) * np.pi / 24), np.sin(np.arange(48) * np.pi / 24)], axis=-1)
+
 
 def _regular(corners: int) -> FloatArray:
     turns = np.arange(corners) * 2.0 * np.pi / corners

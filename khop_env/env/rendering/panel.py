@@ -11,6 +11,7 @@ from khop_env.env.rendering.canvas import Canvas, Rect
 from khop_env.env.rendering.links import DOWN, FRESH, draw_link, faded
 from khop_env.env.rendering.looks import (
     ALARM_COLOR,
+    CIRCLE,
     INK,
     LEADER_COLOR,
     PALE,
@@ -20,6 +21,7 @@ from khop_env.env.rendering.looks import (
     Look,
     mix,
 )
+from khop_env.env.rendering.on_map import OnMap
 from khop_env.env.rendering.scene import Scene
 from khop_env.observers import FloatArray
 
@@ -29,7 +31,6 @@ _MOST_TYPES, _MOST_TYPES_WITH_LINKS = 9, 5  # that the legend has room for
 _STAR = np.array(
     [[r * math.sin(a), r * math.cos(a)] for a, r in zip(np.arange(10) * math.pi / 5, [1, 0.45] * 5, strict=True)]
 )
-CIRCLE = np.stack([np.cos(np.arange(48) * math.pi / 24), np.sin(np.arange(48) * math.pi / 24)], axis=-1)
 
 
 def draw_agent(
@@ -87,7 +88,13 @@ class Panel:
         self._estimator = estimator
 
     def draw(
-        self, canvas: Canvas, scene: Scene, hidden: int, unbounded: int = 0, ages: FloatArray | None = None
+        self,
+        canvas: Canvas,
+        scene: Scene,
+        hidden: int,
+        unbounded: int = 0,
+        ages: FloatArray | None = None,
+        additions: OnMap | None = None,
     ) -> None:
         """Draw it.
 
@@ -97,6 +104,7 @@ class Panel:
             hidden: number of guaranteed boxes that are larger than the view.
             unbounded: number of targets that have no bound, and so no box.
             ages: (K,) of what the observer knows of its targets, in s; None for continuous exchange.
+            additions: of the task.
         """
         self._line = self._top + 12 * self._unit
         self._write(canvas, f"t = {scene.t:.2f} s", size=20, advance=38)
@@ -106,6 +114,10 @@ class Panel:
         if self._estimator:
             self._write(canvas, f"estimator  {self._estimator}", advance=20)
         self._draw_legend(canvas, scene)
+        if additions is not None:
+            for text, symbol in additions.symbols.items():
+                additions.draw_symbol(symbol, self._symbol(), 11 * self._unit)
+                self._write(canvas, text, indent=34, advance=21)
         if self._observer is not None:
             self._draw_estimates(canvas, self._observer, ages)
         if hidden:

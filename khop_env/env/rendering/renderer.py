@@ -14,7 +14,7 @@ from khop_env.env.rendering.canvas import Canvas, Window
 from khop_env.env.rendering.estimates import Estimates, default_observer
 from khop_env.env.rendering.links import LinkLines
 from khop_env.env.rendering.looks import PALE, SOFT, angles, headings, looks, sensible, short_names, undirected
-from khop_env.env.rendering.on_map import OnMap
+from khop_env.env.rendering.on_map import Extent, OnMap
 from khop_env.env.rendering.panel import Panel, draw_agent, draw_task_edge
 from khop_env.env.rendering.scene import Scene
 from khop_env.env.rendering.trails import Trails
@@ -47,6 +47,7 @@ class Renderer:
         title: text above the picture.
         error_label: name of the error beside the map.
         error_unit: its unit; by default that of positions.
+        panel: whether there is a strip with time, errors and legend beside the map.
         size: width and height in pixels.
 
     Attributes:
@@ -70,6 +71,7 @@ class Renderer:
         title: str = "",
         error_label: str = "task error",
         error_unit: str | None = None,
+        panel: bool = True,
         size: tuple[int, int] = (900, 720),
     ) -> None:
         fleet, agents = design.fleet, len(design.fleet)
@@ -90,12 +92,12 @@ class Renderer:
         self._thin = self._unit * (0.5 if self._crowded else 1.0)
         self._links = LinkLines(design.links, self._radius, self._thin)
         self._neighbors = frozenset(self._links.pairs)
-        panel = 212 * self._unit
+        strip = (212 if panel else 16) * self._unit
         left, top, bottom = 58 * self._unit, 40 * self._unit, 50 * self._unit
-        self._map = (left, top, size[0] - left - panel, size[1] - top - bottom)
+        self._map = (left, top, size[0] - left - strip, size[1] - top - bottom)
         self._rows = top + self._map[3] * (np.arange(agents) + 0.5) / agents
         self._panel = Panel(
-            (size[0] - panel + 20 * self._unit, top, panel - 36 * self._unit, self._map[3]),
+            (size[0] - strip + 20 * self._unit, top, strip - 36 * self._unit, self._map[3]),
             self._unit,
             {f"{kind}  {self._span(kind)}": look for kind, look in self._looks.items()},
             driven=driven_label if self._driven else None,
@@ -105,7 +107,8 @@ class Renderer:
             error_unit=fleet.position_unit() if error_unit is None else error_unit,
             estimator=estimator,
         )
-        self._network = "" if network is None else described(network)
+        self._with_panel = panel
+        self._network = "" if network is None or not panel else described(network)
         self._canvas: Canvas | None = None
         self._window: Window | None = None
         self._dismissed = False
@@ -201,8 +204,9 @@ class Renderer:
         half = self._estimates.half_widths(scene.bounds)
         unbounded = int(np.count_nonzero(~np.isfinite(half).all(axis=1)))
         hidden = self._draw_boxes(canvas, estimated, half)
+        additions = OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius)
         if scene.decorate is not None:
-            scene.decorate(OnMap(canvas, self._pixels_in_plane, self._camera.meters, self._radius))
+            scene.decorate(additions)
         self._links.draw(canvas, middles, scene)
         for i, j in self._tasks:
             if np.isfinite(middles[[i, j]]).all():
@@ -211,8 +215,9 @@ class Renderer:
         self._draw_estimates(canvas, scene.estimates, middles, estimate_pixels)
         self._draw_labels(canvas, middles, estimate_pixels)
         canvas.clip(None)
-        ages = None if scene.messages is None else self._estimates.ages(scene.messages)
-        self._panel.draw(canvas, scene, hidden, unbounded, ages)
+        if self._with_panel:
+            ages = None if scene.messages is None else self._estimates.ages(scene.messages)
+            self._panel.draw(canvas, scene, hidden, unbounded, ages, additions)
         canvas.finish()
         return canvas
 
@@ -221,10 +226,16 @@ class Renderer:
         return sensible(x[self._fleet.position_index[:, :2]])
 
     def _follow(self, positions: FloatArray, estimated: FloatArray, scene: Scene) -> None:
-        half = self._estimates.half_widths_in_view(scene.bounds)
-        points = np.concatenate([positions, estimated - half, estimated + half])
-        points = points[np.all(np.isfinite(points), axis=1)]
-        self._camera.follow(np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), scene.t - self._drawn)
+        extent = Extent()
+        if scene.decorate is not None:
+            scene.decorate(extent)
+        boxes = [estimated]
+        if not extent.points:  # otherwise the task says what is to be seen, and the view is steady
+            half = self._estimates.half_widths_in_view(scene.bounds)
+            boxes = [estimated - half, estimated + half]
+        points = np.concatenate([positions, *boxes])
+        points = np.concatenate([np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), *map(sensible, extent.points)])
+        self._camera.follow(points[np.all(np.isfinite(points), axis=1)], scene.t - self._drawn)
         self._drawn = scene.t
 
     def _pixels(self, points: FloatArray, agents: IntArray) -> FloatArray:

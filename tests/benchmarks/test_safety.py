@@ -1,0 +1,73 @@
+"""Certified bounds keep agents apart, whatever messages, graphs and policies; point estimates don't."""
+
+import json
+
+import pytest
+from PIL import Image
+
+from benchmarks import safety, safety_film
+
+
+@pytest.fixture(scope="module")
+def counted():
+    """200 episodes of 8 agents with certified bounds, and 40 of them on point estimates."""
+    return list(safety.collisions(200, durations={8: 8.0}))
+
+
+def test_200_episodes_without_a_collision(counted):
+    """And the same filter on point estimates collides in most of them, so that the test can fail."""
+    certified, points = ([each for each in counted if each.margin == margin] for margin in ("certified", "none"))
+    found = safety.summary(certified)
+    assert (found["episodes"], found["collisions"], found["infeasible"]) == (200, 0, 0)
+    assert 0.4 <= found["min_distance"] < 0.45  # they did meet
+    assert {each.policy for each in certified} == set(safety.POLICIES)
+    assert safety.summary(points)["episodes"] == 40
+    assert safety.summary(points)["collisions"] > 10
+
+
+def test_limits_of_a_rate():
+    """The rate at which so few collisions have a probability of 5 %."""
+    assert safety.upper_limit(0, 10_000) < 3e-4
+    assert (1.0 - safety.upper_limit(0, 10_000)) ** 10_000 == pytest.approx(0.05)
+    limit = safety.upper_limit(1, 50)
+    assert (1.0 - limit) ** 50 + 50 * limit * (1.0 - limit) ** 49 == pytest.approx(0.05)
+    assert safety.upper_limit(3, 3) == 1.0
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_an_interrupt_loses_nothing(counted, monkeypatch, capsys, form):
+    """What was counted until then is printed, and the status is that of an interrupted command."""
+
+    def stopped(episodes, seed, progress):
+        yield from counted[:3]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(safety, "collisions", stopped)
+    monkeypatch.setattr("sys.argv", ["safety", *form])
+    with pytest.raises(SystemExit, match="130"):
+        safety.main()
+    printed = capsys.readouterr().out
+    if form:
+        found = json.loads(printed)
+        assert found["interrupted"]
+        assert len(found["rows"]) == 3
+        assert found["totals"]["certified"]["collisions"] == 0
+    else:
+        assert "certified bounds: 0 of" in printed
+        assert counted[0].condition in " ".join(printed.split())
+
+
+def test_a_film_of_both(tmp_path, monkeypatch):
+    """Side by side until both are over; the agents that collide are counted."""
+    path = tmp_path / "film.gif"
+    monkeypatch.setattr("sys.argv", ["safety_film", str(path), "--scenario", "swap:duration=2.5", "--observer", "7"])
+    counts = []
+    step = safety_film.Half.step
+    monkeypatch.setattr(
+        safety_film.Half, "step", lambda half: (step(half), counts.append((half.title, half.collisions)))
+    )
+    safety_film.main()
+    with Image.open(path) as film:
+        assert film.size == (1036, 480)
+        assert film.n_frames >= 25
+    assert dict(counts) == {"filter on point estimates": 2, "filter on certified bounds": 0}
