@@ -104,7 +104,7 @@ def _furthest(rows: FloatArray, used: int, dx: float, dy: float) -> tuple[float,
 
 @compiled
 def _interval(rows: FloatArray, m: int) -> tuple[float, float]:
-    """The part of row m's line, a b + s (-a_y, a_x), that rows before it leave: low <= s <= high, none if low > high."""
+    """What rows before it leave of row m's line, a b + s (-a_y, a_x): low <= s <= high, nothing if low > high."""
     ax, ay = rows[m, 0], rows[m, 1]
     px, py = ax * rows[m, 2], ay * rows[m, 2]
     low, high = -math.inf, math.inf

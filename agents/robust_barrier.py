@@ -28,10 +28,12 @@ class RobustBarrier(KeepRight):
     """`keep_right`, with inputs changed as little as a barrier for each other agent demands.
 
     h = |p_j - p_i| - B_j - 2 r, with the estimate of p_j, and B_j the distance from it to a corner of its certified
-    box. For every motion of the other, h' >= -alpha h: as if it drove at full speed towards the agent, which is how fast
-    its bound grows. With e, the direction to the estimate, that is
-    e . v_i <= alpha h - (largest speed of j along e) - (largest disturbance of i along e). Likewise, without a speed of
-    the other, for the nearest points of obstacles.
+    box. It demands h' >= -alpha h for every motion of the other: as if it drove at full speed towards the agent, which
+    is how fast its bound grows. With e, the direction to the estimate, that is
+
+        e . v_i <= alpha h - (largest speed of j along e) - (largest disturbance of i along e)
+
+    and for the nearest points of obstacles the same without a speed of j.
 
     It isn't always solvable: surrounded by others, or by large bounds, an agent can't retreat from all. It then takes
     the velocity with the smallest of the largest violations, within its input limits: it retreats as well as it can. So

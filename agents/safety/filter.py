@@ -97,8 +97,8 @@ class SafetyFilter:
         self.announce, self.needs_messages = bool(announce), ANNOUNCED if announce else 0
         if dead_reckoning and self.margin == "certified":
             raise ValueError(
-                "dead_reckoning=True needs margin='none' or a number of metres; got margin='certified', whose bounds are "
-                "those of estimates as they are"
+                "dead_reckoning=True needs margin='none' or a number of metres; got margin='certified', whose bounds "
+                "are those of estimates as they are"
             )
         self.dead_reckoning = bool(dead_reckoning)
         self.radius, self._bounds = radius, bounds
