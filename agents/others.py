@@ -72,7 +72,7 @@ class Others:
         """
         if len(flat) != len(self.velocity):
             self._allocate(len(flat))
-        _reckon(*self._columns, flat, self._now, self._stamp, self._time, self._place, self.velocity, self.ahead)
+        _reckon(self._columns, flat, self._now, self._stamp, self._time, self._place, self.velocity, self.ahead)
         self._now += self.period
         for pair, model, columns in self._measured:
             x = np.empty((len(flat), model.n))
@@ -127,12 +127,7 @@ def _state(layout: ObservationLayout, start: int, name: str, model: AgentModel) 
 
 @compiled
 def _reckon(
-    own: Any,
-    position: Any,
-    valid: Any,
-    age: Any,
-    held: Any,
-    limit: FloatArray,
+    columns: Any,
     flat: Float32Array,
     now: float,
     stamp: FloatArray,
@@ -142,6 +137,7 @@ def _reckon(
     ahead: FloatArray,
 ) -> None:
     """Overwrite `velocity` and `ahead`; `stamp`, `time` and `place` are those of the last position that arrived."""
+    own, position, valid, age, held, limit = columns
     for b in range(flat.shape[0]):
         for pair in range(len(valid)):
             ahead[b, pair, 0] = ahead[b, pair, 1] = 0.0

@@ -85,7 +85,7 @@ def make_policy(spec: str) -> Policy:
         return LawPolicy(name, parameters)
     if name not in POLICIES:
         raise ValueError(f"no policy {name!r}; {did_you_mean(name, (*POLICIES, FILTER, *ALGORITHMS))}")
-    hints = get_type_hints(FLOOR[name].__init__)  # type: ignore[misc]
+    hints = get_type_hints(FLOOR[name].__init__)
     known = {key: kind for key, kind in hints.items() if key != "return"}
     if argument and not known:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")

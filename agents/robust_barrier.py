@@ -53,7 +53,7 @@ class RobustBarrier(KeepRight):
 
     needs_bounds = True
 
-    def __init__(self, alpha: float = 5.0) -> None:
+    def __init__(self, alpha: float = 10.0) -> None:
         if not 0.0 < alpha < math.inf:
             raise ValueError(f"alpha must be positive and finite; got {alpha!r}")
         self.alpha = float(alpha)
