@@ -29,7 +29,7 @@ class Others:
     velocity times their age. Estimates of other models are predictions already.
 
     Args:
-        env: in the plane; observations may be without ages, and are then taken as new at each step.
+        env: in the plane; observations without ages, or of the truth, are taken as new at each step.
 
     Attributes:
         velocity: (B, P, 2) in m/s, per pair of an agent and one of its slots, sorted by agent; of the last `update`.
@@ -50,7 +50,10 @@ class Others:
                 own.append([start + layout.index(f"own.{axis}") for axis in env.models[agent].position])
                 position.append(start + layout.columns(f"{name}.position"))
                 valid.append(start + layout.index(f"{name}.valid"))
-                age.append(start + layout.index(f"{name}.age") if f"{name}.age" in layout.names else -1)
+                late = (
+                    f"{name}.age" in layout.names and env.observe != "oracle"
+                )  # on the truth ages are of messages only
+                age.append(start + layout.index(f"{name}.age") if late else -1)
                 held.append(model is not None and model.type in HELD and age[-1] >= 0)
                 limit.append(np.zeros(2) if model is None else fastest(model))
                 if model is not None and model.type not in (*VELOCITY_INPUTS, "unicycle"):

@@ -36,9 +36,9 @@ class RobustBarrier(KeepRight):
     and for the nearest points of obstacles the same without a speed of j.
 
     It isn't always solvable: surrounded by others, or by large bounds, an agent can't retreat from all. It then takes
-    the velocity with the smallest of the largest violations, within its input limits: it retreats as well as it can. So
-    it has no guarantee, and collides where losses come in bursts (docs/theory_safety.md, "Not this"). For agents whose
-    input is a velocity.
+    the velocity at which the largest violation is smallest, within its input limits and what obstacles leave: it
+    retreats as well as it can. So it has no guarantee, and collides where losses come in bursts (docs/theory_safety.md,
+    "Not this"). For agents whose input is a velocity.
 
     Args:
         alpha: in 1/s, above 0.
@@ -145,6 +145,7 @@ def _choose(
             box_limits(low[b, i, 0], high[b, i, 0], low[b, i, 1], high[b, i, 1], rows)
             push = math.sqrt(pushed[i, 0] ** 2 + pushed[i, 1] ** 2)
             used = obstacle_limits(flat, b, obstacle[i], radius, alpha, push, rows, BOX)
+            hard = used
             for pair in range(first[i], first[i + 1]):
                 if valid[pair] >= 0 and flat[b, valid[pair]] < 0.5:
                     continue
@@ -156,5 +157,5 @@ def _choose(
                 rows[used, 0], rows[used, 1] = ex, ey
                 rows[used, 2] = alpha * (distance - corner - 2.0 * radius) - across
                 used += 1
-            x, y, kept = best_velocity(rows, BOX, used, wish[b, i, 0], wish[b, i, 1])
+            x, y, kept = best_velocity(rows, hard, used, wish[b, i, 0], wish[b, i, 1])
             chosen[b, i, 0], chosen[b, i, 1], infeasible[b, i] = x, y, not kept

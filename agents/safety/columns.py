@@ -170,7 +170,7 @@ def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) ->
         ValueError: if no radius is given, nor in observations.
     """
     layout = env.layouts[agent]
-    names, axes = set(layout.names), env.models[agent].position
+    names = set(layout.names)
     column = -1
     if radius is None:
         if "radius" not in names:
@@ -179,8 +179,8 @@ def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) ->
                 "are: give SafetyFilter or shielded() radius=, in m"
             )
         column = start + layout.index("radius")
-    count = next(q for q in range(len(names)) if f"obstacle{q}.{axes[0]}" not in names)
-    places = [[start + layout.index(f"obstacle{q}.{axis}") for axis in axes] for q in range(count)]
+    count = len({name.partition(".")[0] for name in names if name.startswith("obstacle")})
+    places = [start + layout.columns(f"obstacle{q}") for q in range(count)]
     return column, np.array(places, np.int64).reshape(-1, 2)
 
 

@@ -229,13 +229,13 @@ class SafetyFilter:
 
 
 def _held(env: EnvDescription) -> Others:
-    """Others, whose positions dead reckoning moves on.
+    """Others, whose positions dead reckoning moves on; it leaves the truth as it is.
 
     Raises:
-        ValueError: if there are none.
+        ValueError: if there are none on estimates.
     """
     others = Others(env)
-    if not others.moved_on.any():
+    if env.observe != "oracle" and not others.moved_on.any():
         raise ValueError(
             "dead_reckoning=True has nothing to do: it moves on estimates of integrators that hold the last position "
             "that arrived, by the age of their slots; give the environment a network, or leave it out for other models "
