@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from agents.others import side_by_side
 from agents.policy import EnvDescription, Observations
 from agents.scripted import Reader
 from agents.velocity_law import VELOCITY_INPUTS
@@ -52,20 +53,34 @@ class GoToGoal:
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """Inputs as fractions of their limits."""
         shape = next(iter(observations.values())).shape[:-1]
-        flat = np.concatenate(
-            [np.asarray(observations[agent]).reshape(-1, observations[agent].shape[-1]) for agent in self._models],
-            axis=1,
-        )
+        flat = side_by_side(observations, tuple(self._models))
         states = self._reader.view(flat, None).x
-        actions = {}
-        for i, (agent, model) in enumerate(self._models.items()):
+        ways = {}
+        for i, agent in enumerate(self._models):
             seen = np.asarray(observations[agent], dtype=float).reshape(len(flat), -1)
-            way = self.way(agent, states[:, self._fleet.position_index[i]], seen)
-            u = towards(model, states[:, self._fleet.state_slice(i)], way)
+            ways[agent] = self.way(agent, states[:, self._fleet.position_index[i]], seen)
+        actions = {}
+        for agent, u in self.inputs(flat, states, ways).items():
+            model = self._models[agent]
             actions[agent] = np.zeros((len(flat), self._sizes[agent]), np.float32)
             actions[agent][:, : model.m] = u / model.input_limit
             actions[agent] = actions[agent].reshape(*shape, -1)
         return actions
+
+    def inputs(self, flat: Float32Array, states: FloatArray, ways: dict[str, FloatArray]) -> dict[str, FloatArray]:
+        """By agent the inputs (B, m), within the limits.
+
+        Args:
+            flat: (B, D) observations of all agents, side by side.
+            states: (B, n) of all agents.
+            ways: by agent (B, d), where it is to go.
+        """
+        return {agent: towards(model, states[:, part], ways[agent]) for agent, model, part in self._agents()}
+
+    def _agents(self) -> Iterator[tuple[str, AgentModel, slice]]:
+        """Ids, models, and where their states are."""
+        for i, (agent, model) in enumerate(self._models.items()):
+            yield agent, model, self._fleet.state_slice(i)
 
     def way(self, agent: str, position: FloatArray, seen: FloatArray) -> FloatArray:
         """Where an agent is to go, (B, d) in m, from where it is.
@@ -93,8 +108,7 @@ class KeepRight(GoToGoal):
             ValueError: if an agent has no goal, or positions aren't in the plane.
         """
         super().reset(env, seeds)
-        if self._fleet.position_dim != 2:
-            raise ValueError(f"keep_right needs positions in the plane; here they have {self._fleet.position_dim} axes")
+        require_plane("keep_right", env)
         self._others, self._known = {}, {}
         for agent, layout in env.layouts.items():
             slots = range(len(layout.slots))
@@ -130,6 +144,23 @@ class KeepRight(GoToGoal):
         aside = left > 0.0
         left -= self._period
         return np.where(aside[:, None], detour, way)
+
+
+def require_plane(name: str, env: EnvDescription) -> None:
+    """Refuse agents that don't move in the plane.
+
+    Args:
+        name: of the policy.
+        env: the environment.
+
+    Raises:
+        ValueError: naming the policy and the number of axes.
+    """
+    axes = len(next(iter(env.models.values())).position)
+    if axes != 2:
+        raise ValueError(
+            f"{name} needs positions in the plane; here they have {axes} {'axis' if axes == 1 else 'axes'}"
+        )
 
 
 def towards(model: AgentModel, x: FloatArray, way: FloatArray) -> FloatArray:

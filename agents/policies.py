@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, get_type_hints
 
 from agents.laws import LAWS
 from agents.learning.config import ALGORITHMS
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.navigation import GoToGoal, KeepRight
+from agents.orca import Orca
 from agents.policy import Policy
+from agents.robust_barrier import RobustBarrier
 from agents.safety import Margin, SafetyFilter
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
 from khop_env.registry import environments, parameters_from_text
 
-FLOOR: dict[str, type[ZeroPolicy] | type[RandomPolicy] | type[GoToGoal]] = {
+FLOOR: dict[str, Callable[..., Policy]] = {
     "zero": ZeroPolicy,
     "random": RandomPolicy,
     "bang_bang": BangBangPolicy,
     "go_to_goal": GoToGoal,
     "keep_right": KeepRight,
+    "orca": Orca,
+    "robust_barrier": RobustBarrier,
 }
 FILTER = "filter"
-FILTER_OPTIONS = {"margin": str, "gamma": float, "announce": bool, "radius": float, "bounds": bool}
+FILTER_OPTIONS = {
+    "margin": str,
+    "gamma": float,
+    "announce": bool,
+    "radius": float,
+    "bounds": bool,
+    "dead_reckoning": bool,
+}
 """Options of the safety filter in a policy's name, and their types."""
 POLICIES = (*LAWS, *FLOOR)
 """Names of the scripted policies."""
@@ -36,6 +47,7 @@ def make_policy(spec: str) -> Policy:
         make_policy("tanh")                  # shipped tuned parameters if there are any, else the defaults
         make_policy("linear:gain=2,cancel_drift=true")
         make_policy("zero")
+        make_policy("orca:horizon=1")        # a baseline in navigation_v0, as robust_barrier:alpha=2
         make_policy("ppo:runs/first")        # written by khop train: its folder, or one of the .npz files in it
         make_policy("ppo:pretrained")        # shipped with the library for some environments and scenarios
         make_policy("ppo:pretrained/consensus_v0")  # the shipped policy for this environment
@@ -73,9 +85,15 @@ def make_policy(spec: str) -> Policy:
         return LawPolicy(name, parameters)
     if name not in POLICIES:
         raise ValueError(f"no policy {name!r}; {did_you_mean(name, (*POLICIES, FILTER, *ALGORITHMS))}")
-    if argument:
+    hints = get_type_hints(FLOOR[name].__init__)
+    known = {key: kind for key, kind in hints.items() if key != "return"}
+    if argument and not known:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
-    return FLOOR[name]()
+    found = _options(spec, argument, known)
+    try:
+        return FLOOR[name](**found)
+    except ValueError as error:
+        raise ValueError(f"policy {spec!r}: {error}") from error
 
 
 def shielded(policy: str | Policy, margin: Margin = "certified", **options: Any) -> SafetyFilter:
@@ -110,11 +128,12 @@ class Needs(NamedTuple):
 
 
 def needs(policy: Policy) -> Needs:
-    """What a policy needs of its environment: bounds in a certified filter, or trained with them; messages."""
+    """What a policy needs of its environment: bounds that it reads, or was trained with; numbers in messages."""
     if isinstance(policy, SafetyFilter):
         inside = needs(policy.policy)
         return Needs(policy.needs_bounds or inside.bounds, policy.needs_messages + inside.message_size)
-    return Needs(isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds")), 0)
+    trained = isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
+    return Needs(trained or bool(getattr(policy, "needs_bounds", False)), 0)
 
 
 def _filter(spec: str, argument: str) -> SafetyFilter:
@@ -122,16 +141,22 @@ def _filter(spec: str, argument: str) -> SafetyFilter:
     options, colon, inside = argument.partition(":")
     if "=" not in options:
         options, inside = "", argument
-    found = parameters_from_text(options, FILTER_OPTIONS, f"policy {spec!r}")
-    for key in found:
-        if key not in FILTER_OPTIONS:
-            raise ValueError(f"policy {spec!r}: no option {key!r}; {did_you_mean(key, FILTER_OPTIONS)}")
+    found = _options(spec, options, FILTER_OPTIONS)
     if colon and not inside:
         raise ValueError(f"policy {spec!r}: expected {FILTER}:OPTION=VALUE,...:POLICY; there is no policy")
     try:
         return shielded(inside or "keep_right", **found)
     except ValueError as error:
         raise ValueError(f"policy {spec!r}: {error}") from error
+
+
+def _options(spec: str, text: str, known: Mapping[str, Any]) -> dict[str, Any]:
+    """The options in a policy's name; `known` has their types."""
+    found = parameters_from_text(text, known, f"policy {spec!r}")
+    for key in found:
+        if key not in known:
+            raise ValueError(f"policy {spec!r}: no option {key!r}; {did_you_mean(key, known)}")
+    return found
 
 
 def _user_policy(spec: str) -> Policy:

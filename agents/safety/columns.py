@@ -60,7 +60,7 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
             _require_all_known(agent, layout, env)
         place = _own(agent, env)
         own.append((start + place, layout.high[place].astype(float), 1.01 * (tracking[agent] + _rounding(agent, env))))
-        of_bodies.append(_bodies(agent, env, start, radius))
+        of_bodies.append(bodies(agent, env, start, radius))
         for number, slot in enumerate(layout.slots):
             name, other = f"slot{number}", tracking.get(slot.id, np.zeros(2))
             place = layout.columns(f"{name}.position")
@@ -157,10 +157,20 @@ def _own(agent: str, env: EnvDescription) -> IntArray:
     return np.array([env.layouts[agent].index(f"own.{axis}") for axis in env.models[agent].position])
 
 
-def _bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -> tuple[int, IntArray]:
-    """The column of the bodies' radius, -1 if it is given, and (M, 2) those of obstacles' nearest points."""
+def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -> tuple[int, IntArray]:
+    """The column of the bodies' radius, -1 if it is given, and (M, 2) those of obstacles' nearest points.
+
+    Args:
+        agent: the observing agent's id.
+        env: the environment.
+        start: the agent's first column in the observations of all agents, side by side.
+        radius: None for what observations say.
+
+    Raises:
+        ValueError: if no radius is given, nor in observations.
+    """
     layout = env.layouts[agent]
-    names, axes = set(layout.names), env.models[agent].position
+    names = set(layout.names)
     column = -1
     if radius is None:
         if "radius" not in names:
@@ -169,8 +179,8 @@ def _bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -
                 "are: give SafetyFilter or shielded() radius=, in m"
             )
         column = start + layout.index("radius")
-    count = next(q for q in range(len(names)) if f"obstacle{q}.{axes[0]}" not in names)
-    places = [[start + layout.index(f"obstacle{q}.{axis}") for axis in axes] for q in range(count)]
+    count = len({name.partition(".")[0] for name in names if name.startswith("obstacle")})
+    places = [start + layout.columns(f"obstacle{q}") for q in range(count)]
     return column, np.array(places, np.int64).reshape(-1, 2)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
+from agents.others import Others, side_by_side
 from agents.policy import EnvDescription, Observations, Policy
 from agents.safety.columns import ANNOUNCED, Margin, read_columns, without_bounds
 from agents.safety.moves import filter_moves, periods_of_rest
@@ -56,6 +57,9 @@ class SafetyFilter:
         radius: of an agent's body in m; None for the column `radius` of observations.
         bounds: whether the policy inside observes bounds; None for what a learned policy was trained with, and no
             bounds for others.
+        dead_reckoning: whether others' positions, which estimates of integrators hold until a message arrives, are
+            moved on by the velocity between the last two that arrived (`agents.others.Others`); with a margin other
+            than "certified", whose boxes hold all that may have happened since.
 
     Attributes:
         policy: the policy inside.
@@ -81,6 +85,7 @@ class SafetyFilter:
         announce: bool = False,
         radius: float | None = None,
         bounds: bool | None = None,
+        dead_reckoning: bool = False,
     ) -> None:
         if not 0.0 < gamma <= 1.0:
             raise ValueError(f"gamma must be above 0 and at most 1; got {gamma!r}")
@@ -90,6 +95,12 @@ class SafetyFilter:
         if announce and self.margin != "certified":
             raise ValueError(f"announce=True is for margin='certified'; got margin={margin!r}")
         self.announce, self.needs_messages = bool(announce), ANNOUNCED if announce else 0
+        if dead_reckoning and self.margin == "certified":
+            raise ValueError(
+                "dead_reckoning=True needs margin='none' or a number of metres; got margin='certified', whose bounds "
+                "are those of estimates as they are"
+            )
+        self.dead_reckoning = bool(dead_reckoning)
         self.radius, self._bounds = radius, bounds
         self.needs_bounds = self.margin == "certified"
         self.wanted: dict[str, Float32Array] = {}
@@ -100,6 +111,8 @@ class SafetyFilter:
     def __repr__(self) -> str:
         announced = ", announce=True" if self.announce else ""
         return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{announced})"
+        reckoning = ", dead_reckoning=True" if self.dead_reckoning else ""
+        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{reckoning})"
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Look up the columns, and reset the policy inside.
@@ -109,6 +122,8 @@ class SafetyFilter:
         """
         self._env = env
         columns = read_columns(env, self.margin, self.radius, self.announce)
+        columns = read_columns(env, self.margin, self.radius)
+        self._others = _held(env) if self.dead_reckoning else None
         self._columns: Any = tuple(columns)
         self._speed, self._own, self._scale = columns.speed, columns.own, columns.scale
         models = enumerate(env.models.values())
@@ -129,13 +144,10 @@ class SafetyFilter:
         if self._kept:
             seen = {agent: np.asarray(observations[agent])[..., self._kept[agent]] for agent in observations}
         self.wanted = self.policy.act(seen)
-        flat = np.concatenate(
-            [
-                np.asarray(observations[agent], np.float32).reshape(-1, observations[agent].shape[-1])
-                for agent in agents
-            ],
-            axis=1,
-        )
+        flat = side_by_side(observations, agents)
+        if self._others is not None:
+            self._others.update(flat)
+            flat = self._others.extrapolated(flat)
         batch = len(flat)
         if self._started.shape[0] != batch:
             if self._started.size:
@@ -214,3 +226,19 @@ class SafetyFilter:
             policy.environment = policy.environment or env.environment
             return bool(policy.about_for(env.scenario).get("bounds"))
         return isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
+
+
+def _held(env: EnvDescription) -> Others:
+    """Others, whose positions dead reckoning moves on; it leaves the truth as it is.
+
+    Raises:
+        ValueError: if there are none on estimates.
+    """
+    others = Others(env)
+    if env.observe != "oracle" and not others.moved_on.any():
+        raise ValueError(
+            "dead_reckoning=True has nothing to do: it moves on estimates of integrators that hold the last position "
+            "that arrived, by the age of their slots; give the environment a network, or leave it out for other models "
+            "(their estimates are predictions)"
+        )
+    return others

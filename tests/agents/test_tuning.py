@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import agents
-from agents import LAWS, LawPolicy, describe, make_law, play, tune
+from agents import LAWS, LawPolicy, describe, make_law, make_policy, play, tune
 from agents.tuned import tuned_parameters
+from agents.tuning import tune_margin
 from khop_env import consensus_v0
 from khop_env.env import Settings
 from khop_env.registry import scenario as by_name
@@ -83,3 +84,24 @@ def test_a_default_gain_is_lowered_on_long_periods():
         policy = LawPolicy(law)
         policy.reset(describe(env), [0])
         assert policy.law.gain == expected < make_law(law).gain
+
+
+def test_the_margin_is_the_smallest_without_a_collision():
+    """As playing each margin says; smaller ones collide."""
+    env, seeds = batched("navigation_v0", "crossing:burst=1", num_envs=16), range(10_000, 10_016)
+    found = tune_margin(env, "filter:margin=none,dead_reckoning=true", seeds)
+    margin = found.parameters["margin"]
+    assert found.collision_rate == 0.0
+    assert found.success_rate > 0.5
+    for chosen in (*np.arange(0.0, margin - 0.01, 0.05), margin):
+        played = play(env, make_policy(f"filter:margin={chosen:g},dead_reckoning=true"), seeds)
+        assert played.outcomes["collision"].any() == (chosen < margin)
+    assert found.mean_return == played.returns.mean()
+    assert margin > 0.0
+
+
+def test_what_has_no_margin_is_refused():
+    env = batched("navigation_v0", "swap:agents=4", num_envs=2)
+    for name in ("filter", "keep_right"):
+        with pytest.raises(ValueError, match=f"policy '{name}' has no margin to tune: name orca, or a safety filter"):
+            tune_margin(env, name, range(2))
