@@ -26,7 +26,7 @@ def tune(
         str | None,
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following); in navigation_v0 policies with a margin: "
-            "filter:margin=none, filter:margin=none,dead_reckoning=true, orca. By default all laws, or the first of these."
+            "filter:margin=none, filter:margin=none,dead_reckoning=true, orca. By default all laws, or the first."
         ),
     ] = None,
     observe: Annotated[
