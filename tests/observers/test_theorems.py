@@ -59,7 +59,7 @@ def run(system: System, integrator: str, law: object | None) -> Simulator:
     else:
         bounds = [funnels.explicit_step_bound() for funnels in (design.states, design.inputs)]
         dt = min(2e-3, np.concatenate(bounds).min(initial=1.0) / 10.0)
-        steps = min(round(0.25 / dt), 400)
+        steps = min(round(0.5 / dt), 800)
     states = Bounds(system, design.states.layout, system.deltas)
     inputs = Bounds(system, design.inputs.layout, system.thetas)
     for step in range(steps):
