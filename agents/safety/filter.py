@@ -109,10 +109,8 @@ class SafetyFilter:
         self.infeasible: dict[str, np.ndarray] = {}
 
     def __repr__(self) -> str:
-        announced = ", announce=True" if self.announce else ""
-        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{announced})"
-        reckoning = ", dead_reckoning=True" if self.dead_reckoning else ""
-        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{reckoning})"
+        options = "".join(f", {name}=True" for name in ("announce", "dead_reckoning") if getattr(self, name))
+        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{options})"
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Look up the columns, and reset the policy inside.
@@ -122,7 +120,6 @@ class SafetyFilter:
         """
         self._env = env
         columns = read_columns(env, self.margin, self.radius, self.announce)
-        columns = read_columns(env, self.margin, self.radius)
         self._others = _held(env) if self.dead_reckoning else None
         self._columns: Any = tuple(columns)
         self._speed, self._own, self._scale = columns.speed, columns.own, columns.scale
