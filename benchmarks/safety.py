@@ -11,11 +11,12 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from agents import make_policy, play, shielded
+from agents.policies import needs
 from agents.policy import EnvDescription, Observations, Policy
 from benchmarks.report import Report
 from khop_env.env import BatchedEnv
@@ -29,7 +30,7 @@ FAMILIES = ("swap", "crossing")
 DURATIONS: Mapping[int, float] = MappingProxyType({8: 15.0, 16: 30.0, 32: 30.0})
 """Numbers of agents, and the length of their episodes in s."""
 SHARE = 5  # of as many episodes one is played on point estimates, too
-_LEAST = 10  # episodes that make it worth it to build an environment
+_LEAST = 20  # episodes that make it worth it to build an environment
 _BATCH = 128
 
 
@@ -87,15 +88,22 @@ POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
 )
 
 
+FILTERS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {"filter": {}, "filter:announce=true": {"announce": True}, "filter:margin=none": {"margin": "none"}}
+)
+CERTIFIED = tuple(FILTERS)[:2]
+TOTALS = {"certified": "certified bounds", "estimated": "point estimates, on some of the same episodes"}
+
+
 class Count(NamedTuple):
-    """Episodes of one policy under one condition.
+    """Episodes of one policy in one filter, under one condition.
 
     Attributes:
         scenario: its family.
         agents: their number.
         condition: one of `CONDITIONS`.
         policy: inside the filter.
-        margin: of the filter.
+        filter: one of `FILTERS`.
         episodes: played.
         collisions: of how many of them bodies touched, at any instant, between samples too.
         min_distance: smallest distance of two agents' centres in m.
@@ -106,7 +114,7 @@ class Count(NamedTuple):
     agents: int
     condition: str
     policy: str
-    margin: str
+    filter: str
     episodes: int
     collisions: int
     min_distance: float
@@ -120,7 +128,7 @@ def collisions(
     durations: Mapping[int, float] = DURATIONS,
     progress: Fraction | None = None,
 ) -> Iterator[Count]:
-    """Play episodes with certified bounds, and a fifth of the same episodes on point estimates.
+    """Play episodes with certified bounds, half of them with announced anchors, and some of them on point estimates.
 
     They are spread evenly over families, numbers of agents, conditions and policies, in random order, so that results
     until an interrupt cover all; few episodes are spread over some of them.
@@ -141,19 +149,20 @@ def collisions(
     for (family, agents, condition, name), count, done in zip(cells, counts, work, strict=True):
         if (family, agents, condition) != before:
             made, before = {}, (family, agents, condition)
-        for margin, part in (("certified", count), ("none", -(-count // SHARE))):
+        parts = -(-count // 2), count // 2, -(-count // SHARE)
+        for (kind, options), part in zip(FILTERS.items(), parts, strict=True):
             if not part:
                 continue
-            batch = min(part, _BATCH)
-            if margin not in made or made[margin].num_envs < batch:
-                made[margin] = environment(family, agents, condition, durations[agents], batch)
-            found = play(made[margin], shielded(POLICIES[name](), margin), range(seed, seed + part)).outcomes
+            policy, batch = shielded(POLICIES[name](), **options), min(part, _BATCH)
+            if kind not in made or made[kind].num_envs < batch:
+                made[kind] = environment(family, agents, condition, durations[agents], batch, policy)
+            found = play(made[kind], policy, range(seed, seed + part)).outcomes
             yield Count(
                 family,
                 agents,
                 condition,
                 name,
-                margin,
+                kind,
                 part,
                 int(found["collision"].sum()),
                 float(found["min_distance"].min()),
@@ -163,14 +172,13 @@ def collisions(
             progress(float(done / work[-1]))
 
 
-def environment(family: str, agents: int, condition: str, duration: float, num_envs: int) -> BatchedEnv:
-    """The environment of a combination."""
+def environment(family: str, agents: int, condition: str, duration: float, num_envs: int, policy: Policy) -> BatchedEnv:
+    """The environment of a combination, with what the policy needs."""
     network, schedule = CONDITIONS[condition]
     graph = "tree" if schedule is None else "regular3"
     chosen = scenario(f"{family}:agents={agents},graph={graph},duration={duration:g}")
-    return make_batched(
-        "navigation_v0", replace(chosen, schedule=schedule), num_envs=num_envs, network=network, bounds=True
-    )
+    arguments = needs(policy).among({"num_envs": num_envs, "network": network})
+    return make_batched("navigation_v0", replace(chosen, schedule=schedule), **arguments)
 
 
 def upper_limit(collided: int, episodes: int) -> float:
@@ -188,7 +196,7 @@ def upper_limit(collided: int, episodes: int) -> float:
 
 
 def summary(counts: Sequence[Count]) -> dict[str, int | float]:
-    """Sums over some counts of one margin, at least one."""
+    """Sums over some counts, at least one."""
     episodes, collided = (sum(getattr(each, name) for each in counts) for name in ("episodes", "collisions"))
     return {
         "episodes": episodes,
@@ -199,6 +207,12 @@ def summary(counts: Sequence[Count]) -> dict[str, int | float]:
     }
 
 
+def totals(counts: Sequence[Count]) -> dict[str, dict[str, int | float]]:
+    """Sums over all episodes with certified bounds, and over those on point estimates, if there are any."""
+    parts = {name: [each for each in counts if (each.filter in CERTIFIED) == (name == "certified")] for name in TOTALS}
+    return {name: summary(some) for name, some in parts.items() if some}
+
+
 def collision_rows(report: Report, quick: bool) -> None:
     """Collisions of a thousand episodes, and of the fifth of them that is played on point estimates, too.
 
@@ -207,16 +221,16 @@ def collision_rows(report: Report, quick: bool) -> None:
         quick: as `benchmark`.
     """
     counts = list(collisions(20, durations={8: 3.0})) if quick else list(collisions(1000))
-    for margin in ("certified", "none"):
-        found = summary([each for each in counts if each.margin == margin])
-        certified = margin == "certified"
-        report.add(f"collisions_{margin}", found["collisions"], f"of {found['episodes']} episodes", "0" * certified)
-        report.add(f"min_distance_{margin}", found["min_distance"], "m", "at least 0.4" * certified)
+    for name, found in totals(counts).items():
+        certified = name == "certified"
+        report.add(f"collisions_{name}", found["collisions"], f"of {found['episodes']} episodes", "0" * certified)
+        report.add(f"min_distance_{name}", found["min_distance"], "m", "at least 0.4" * certified)
 
 
 def print_counts(counts: Sequence[Count]) -> None:
-    """A table by condition, by scenario and by policy, and the totals."""
+    """A table by filter, condition, scenario and policy, and the totals."""
     groups: Sequence[tuple[Sequence[str], Callable[[Count], str]]] = (
+        (CERTIFIED, lambda each: each.filter),
         (list(CONDITIONS), lambda each: each.condition),
         ([_scenario(family, agents) for family in FAMILIES for agents in DURATIONS], _scenario_of),
         (list(POLICIES), lambda each: each.policy),
@@ -226,17 +240,15 @@ def print_counts(counts: Sequence[Count]) -> None:
         rows += [("",) * 6] * bool(rows)
         for name in names:
             if chosen := [each for each in counts if key(each) == name]:
-                rows.append((name, *_cells(chosen)))
-    header = ("condition", "episodes", "collided", "distance", "infeasible", "on point estimates")
-    print_table(header, rows, "Episodes in the certified filter, by condition, by scenario, and by policy inside")
-    for margin, text in (("certified", "certified bounds"), ("none", "point estimates, on the same episodes")):
-        if some := [each for each in counts if each.margin == margin]:
-            found = summary(some)
-            print_text(
-                f"{text}: {found['collisions']} of {found['episodes']} episodes with a collision, a rate below "
-                f"{found['upper_limit_95']:.2g} with 95 % confidence; smallest distance {found['min_distance']:.4f} m, "
-                f"bodies touch at 0.4 m; {found['infeasible']} episodes in which a guarantee had to be begun anew"
-            )
+                rows.append((name, *_cells(totals(chosen))))
+    header = ("with certified bounds", "episodes", "collided", "distance", "infeasible", "on point estimates")
+    print_table(header, rows, "Episodes with a collision, by filter, condition, scenario, and policy inside")
+    for name, found in totals(counts).items():
+        print_text(
+            f"{TOTALS[name]}: {found['collisions']} of {found['episodes']} episodes with a collision, a rate below "
+            f"{found['upper_limit_95']:.2g} with 95 % confidence; smallest distance {found['min_distance']:.4f} m, "
+            f"bodies touch at 0.4 m; {found['infeasible']} episodes in which a guarantee had to be begun anew"
+        )
 
 
 def _scenario(family: str, agents: int) -> str:
@@ -247,13 +259,14 @@ def _scenario_of(count: Count) -> str:
     return _scenario(count.scenario, count.agents)
 
 
-def _cells(counts: Sequence[Count]) -> tuple[str, ...]:
-    margins = [[each for each in counts if each.margin == margin] for margin in ("certified", "none")]
-    certified, estimated = (summary(some) if some else None for some in margins)
-    assert certified is not None
-    cells = (str(certified["episodes"]), str(certified["collisions"]), f"{certified['min_distance']:.4f} m")
-    points = "" if estimated is None else f"{estimated['collisions']} of {estimated['episodes']}"
-    return (*cells, str(certified["infeasible"]), points)
+def _cells(found: Mapping[str, Mapping[str, int | float]]) -> tuple[str, ...]:
+    certified, points = ("", "", "", ""), ""
+    if some := found.get("certified"):
+        distance = f"{some['min_distance']:.4f} m"
+        certified = (str(some["episodes"]), str(some["collisions"]), distance, str(some["infeasible"]))
+    if some := found.get("estimated"):
+        points = f"{some['collisions']} of {some['episodes']}"
+    return (*certified, points)
 
 
 def main() -> None:
@@ -274,12 +287,8 @@ def main() -> None:
     except KeyboardInterrupt:
         interrupted = True
     if chosen.json:
-        totals = {
-            margin: summary(some)
-            for margin in ("certified", "none")
-            if (some := [each for each in counts if each.margin == margin])
-        }
-        print(json.dumps({"interrupted": interrupted, "totals": totals, "rows": [each._asdict() for each in counts]}))
+        rows = [each._asdict() for each in counts]
+        print(json.dumps({"interrupted": interrupted, "totals": totals(counts), "rows": rows}))
     elif counts:
         print_counts(counts)
     if interrupted:

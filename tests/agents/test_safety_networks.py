@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from agents import SafetyFilter, play, shielded
+from agents.policies import needs
 from benchmarks.safety import RammingPolicy
 from khop_env import make_batched
 from khop_env.network import Outage, RandomLinks, Range, Switching
@@ -134,3 +135,14 @@ def test_links_that_come_and_go(name):
     assert 0.4 <= certified["min_distance"].min() < 0.6
     assert not certified["infeasible"].any()
     assert points["collision"].sum() > 0
+
+
+def test_announced_anchors_are_read():
+    """They let more agents through, on the same episodes."""
+    arrived = {}
+    for announce in (False, True):
+        policy = shielded("keep_right", announce=announce)
+        arguments = needs(policy).among({"num_envs": 25})
+        arrived[announce] = play(make_batched("navigation_v0", "crossing", **arguments), policy, range(25)).outcomes
+    assert arrived[True]["success"].mean() > arrived[False]["success"].mean() + 0.1
+    assert not arrived[True]["collision"].any()
