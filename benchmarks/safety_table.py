@@ -146,8 +146,8 @@ def main() -> None:
     limit = 100.0 * (1.0 - 0.05 ** (1.0 / chosen.episodes))
     print(
         "Episodes with a collision in % / with everybody at the goal, and no collision, in % / mean time of arrival "
-        f"in s; {chosen.episodes} episodes each, the same for all (0 of {chosen.episodes}: below {limit:.2g} % with 95 % "
-        "confidence).\n"
+        f"in s; {chosen.episodes} episodes each, the same for all (0 of {chosen.episodes}: below {limit:.2g} % with "
+        "95 % confidence).\n"
     )
     try:
         for scenario in chosen.scenarios:

@@ -43,8 +43,12 @@ def evaluate(
         ),
     ] = None,
     observe: Annotated[
-        str, typer.Option(help="Observation modes: estimate, oracle (true states), local (neighbours only).")
-    ] = "estimate,oracle,local",
+        str | None,
+        typer.Option(
+            help="Observation modes: estimate, oracle (true states), local (neighbours only). By default all three, or "
+            "estimate if a policy reads certified bounds, as a certified filter does."
+        ),
+    ] = None,
     network: Annotated[
         str | None,
         typer.Option(
@@ -69,6 +73,7 @@ def evaluate(
     After an interrupt, or if a worker or policy fails, the rows played until then are printed.
     """
     from agents.comparison import compare
+    from agents.policies import make_policy, needs
     from agents.workers import Interrupted, UnfinishedError
     from khop_env.objects import split_specs
     from khop_env.registry import find_task
@@ -86,14 +91,15 @@ def evaluate(
         single = with_network(arguments, network, estimator)  # refuses two choices
         arguments = single if len(networks) < 2 else with_network(arguments, None, estimator)
         chosen = None if scenario is None else load(scenario)
+        names = [shielded_name(policy, shield) for policy in split_specs(policies or default, "--policies", "policy")]
+        if observe is None:
+            bounded = any(needs(make_policy(name)).bounds for name in names)
+            observe = "estimate" if bounded else "estimate,oracle,local"
         with Progress(f"playing {environment}") as progress:
             try:
                 comparison = compare(
                     environment,
-                    [
-                        shielded_name(policy, shield)
-                        for policy in split_specs(policies or default, "--policies", "policy")
-                    ],
+                    names,
                     [mode.strip() for mode in observe.split(",") if mode.strip()],  # type: ignore[misc]
                     scenario=chosen,
                     arguments=arguments,
