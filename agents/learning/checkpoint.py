@@ -126,6 +126,16 @@ def restore_model(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
     random.setstate(stored["random"]["python"])
 
 
+def restore_networks(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
+    """Restore the networks of a saved model in a new one, but not what its optimizers remember.
+
+    Raises:
+        ValueError: if `stored` doesn't fit the model.
+    """
+    own = _arrays(dict(model.policy.state_dict()))
+    model.policy.load_state_dict(_tensors(restored(own, dict(stored["parameters"]["policy"]), "networks")))
+
+
 def _optimizer_state(optimizer: torch.optim.Optimizer, stored: Any, where: str) -> dict[str, Any]:
     """The stored state after checks, which `load_state_dict` doesn't make."""
     groups = restored(optimizer.state_dict()["param_groups"], stored["param_groups"], f"{where}.param_groups")
