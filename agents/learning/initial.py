@@ -12,6 +12,7 @@ from agents.learning.learned import LearnedPolicy
 from agents.learning.networks import load_actor
 from agents.learning.policy_file import PolicyFileError
 from agents.learning.run_folder import CHECKPOINT
+from agents.learning.scaling import RATE
 from agents.policy import EnvDescription
 
 
@@ -32,7 +33,8 @@ def begin_from(source: str, model: BaseAlgorithm, new: LearnedPolicy, env: EnvDe
     whole = folder.is_dir()
     try:
         policy = LearnedPolicy.load(folder / "last.npz" if whole else folder)
-        policy.reset(dataclasses.replace(env, shielded=True), [0])
+        period = RATE / policy.scaler.rate  # may be another one: features are in m and m/s
+        policy.reset(dataclasses.replace(env, shielded=True, control_period=period), [0])
         if differs := _difference(policy, new):
             raise PolicyFileError(differs)
         if not whole:

@@ -88,7 +88,7 @@ class LearnedPolicy:
             warnings.warn(
                 f"a policy trained inside the safety filter is played outside of it, where agents may collide: put "
                 f"filter:margin={margin}: before its name, or use --shield {margin}",
-                stacklevel=3,
+                stacklevel=1,  # this line, so that it is said once
             )
         self._types, self._before = {agent: model.type for agent, model in env.models.items()}, None
 
