@@ -38,14 +38,14 @@ def parallel(margin="certified", **arguments):
 
 
 def played(policy, cycles, seed):
-    """Observations with bounds, costs, and interventions (T, N) of a filtered policy in a batch of one."""
+    """By control period: observations (N, D) with bounds, and interventions (N,) of a filtered policy."""
     env = make_batched("navigation_v0", bounds=True, num_envs=1, max_cycles=30)
     policy.reset(describe(env), [0])
     observations, _ = env.reset(seed)
     found = []
     for _ in range(cycles):
         actions = policy.act(by_agent(env, observations))
-        observations, _, _, _, infos = env.step(np.stack(list(actions.values()), axis=1))
+        observations, *_ = env.step(np.stack(list(actions.values()), axis=1))
         found.append((observations[0], np.array([policy.intervention[agent][0] for agent in env.agents])))
     return found
 
@@ -152,9 +152,9 @@ def test_refused_actions_change_nothing():
             np.testing.assert_array_equal(values, before[name])
     env.step(fine)
     assert not any(each.any() for each in env.filter.infeasible.values())
-    with pytest.raises(TypeError, match="give them env.unwrapped and the policy shielded"):
+    with pytest.raises(TypeError, match=r"give them env\.unwrapped and the policy shielded"):
         evaluate(env, ["zero"], [0])
-    with pytest.raises(TypeError, match="get_state.. of a ShieldedEnv returned; got EnvState"):
+    with pytest.raises(TypeError, match=r"get_state\(\) of a ShieldedEnv returned; got EnvState"):
         env.set_state(env.unwrapped.get_state())
     with pytest.raises(ValueError, match="there is no policy inside the safety filter"):
         env.filter.act({agent: env.unwrapped.observe(agent) for agent in env.agents})
@@ -217,7 +217,7 @@ def test_a_resumed_training_keeps_the_shield(tmp_path):
 
 def test_shields_are_checked():
     """In words that name the setting, before there is a folder."""
-    with pytest.raises(ValueError, match="shield: margin must be 'certified', 'none' or a number of metres.*'safe'"):
+    with pytest.raises(ValueError, match=r"shield: margin must be 'certified', 'none' or a number of metres.*'safe'"):
         dataclasses.replace(TINY, shield="safe")
     assert dataclasses.replace(TINY, shield="0.3").shield == 0.3
     with pytest.raises(ValueError, match="'cart_0' is a DoubleIntegrator"):
