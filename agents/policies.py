@@ -92,6 +92,22 @@ def shielded(policy: str | Policy, margin: Margin = "certified", **options: Any)
     return SafetyFilter(make_policy(policy) if isinstance(policy, str) else policy, margin, **options)
 
 
+def safety_filter(shield: str, policy: Policy | None, bounds: bool | None = None) -> SafetyFilter:
+    """The safety filter that `--shield` means.
+
+    Args:
+        shield: a margin, and options of `SafetyFilter` after commas: "certified,announce=true".
+        policy: inside; None for a filter that only corrects actions.
+        bounds: whether the policy observes bounds; None as for `SafetyFilter`.
+
+    Raises:
+        ValueError: for a wrong margin or option.
+    """
+    margin, _, options = shield.partition(",")
+    found = {"bounds": bounds, **_options(options, f"shield {shield!r}")}
+    return SafetyFilter(policy, margin, **found)
+
+
 class Needs(NamedTuple):
     """Arguments of an environment that a policy needs.
 
@@ -122,16 +138,22 @@ def _filter(spec: str, argument: str) -> SafetyFilter:
     options, colon, inside = argument.partition(":")
     if "=" not in options:
         options, inside = "", argument
-    found = parameters_from_text(options, FILTER_OPTIONS, f"policy {spec!r}")
-    for key in found:
-        if key not in FILTER_OPTIONS:
-            raise ValueError(f"policy {spec!r}: no option {key!r}; {did_you_mean(key, FILTER_OPTIONS)}")
+    found = _options(options, f"policy {spec!r}")
     if colon and not inside:
         raise ValueError(f"policy {spec!r}: expected {FILTER}:OPTION=VALUE,...:POLICY; there is no policy")
     try:
         return shielded(inside or "keep_right", **found)
     except ValueError as error:
         raise ValueError(f"policy {spec!r}: {error}") from error
+
+
+def _options(text: str, where: str) -> dict[str, Any]:
+    """Options of the safety filter by name."""
+    found = parameters_from_text(text, FILTER_OPTIONS, where)
+    for key in found:
+        if key not in FILTER_OPTIONS:
+            raise ValueError(f"{where}: no option {key!r}; {did_you_mean(key, FILTER_OPTIONS)}")
+    return found
 
 
 def _user_policy(spec: str) -> Policy:

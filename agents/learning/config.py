@@ -40,8 +40,8 @@ class TrainingConfig:
         bounds: whether observations hold the guaranteed bounds.
         rates: whether networks get how fast positions change, too, as differences of observations.
         nearest: whether networks get other agents in the order of their distances, and not in that of the slots.
-        shield: margin of a safety filter that corrects actions before the environment gets them: "certified", "none" or
-            a number of m; None for no filter.
+        shield: a safety filter that corrects actions before the environment gets them: its margin, "certified", "none"
+            or a number of m, and options after commas, "certified,announce=true"; None for no filter.
         initial: folder of another run, of which policy, value function and exploration are taken on, or a policy's
             file; None for random networks.
         algorithm: learning algorithm, "ppo" or "sac".
@@ -98,12 +98,10 @@ class TrainingConfig:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         object.__setattr__(self, "arguments", dict(self.arguments))
         if self.shield is not None:
-            from agents.safety import as_margin  # which itself imports the learned policies
+            from agents.policies import safety_filter  # which itself imports the learned policies
 
-            try:
-                object.__setattr__(self, "shield", as_margin(self.shield))
-            except ValueError as error:
-                raise ValueError(f"shield: {error}") from None
+            object.__setattr__(self, "shield", str(self.shield))
+            safety_filter(str(self.shield), None)
         for name in ("observe", "bounds", "num_envs", "scenario"):
             if name in self.arguments:
                 raise ValueError(f"arguments: {name!r} is a setting of its own, {name}={self.arguments[name]!r}")

@@ -12,8 +12,8 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 from agents.learning.config import TrainingConfig
 from agents.learning.scaling import MOST, ObservationScaler
 from agents.learning.shielded import ShieldedSB3VecEnv
+from agents.policies import needs, safety_filter
 from agents.policy import EnvDescription, describe
-from agents.safety import SafetyFilter
 from khop_env.env import BatchedEnv
 from khop_env.env.layout import Float32Array
 from khop_env.env.sb3 import KHopSB3VecEnv
@@ -32,9 +32,11 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
     """
     where = {} if config.scenario is None else {"scenario": config.scenario}
     count = config.num_envs if num_envs is None else num_envs
-    bounds = config.bounds or config.shield == "certified"  # the filter needs them, the learner doesn't get them
-    of_config: dict[str, Any] = {"observe": config.observe, "bounds": bounds}
-    return make_batched(config.environment, **where, num_envs=count, **of_config, **config.arguments)
+    arguments: dict[str, Any] = {"bounds": config.bounds, **config.arguments}
+    if config.shield is not None:  # the learner doesn't get what the filter needs
+        needed = needs(safety_filter(str(config.shield), None))
+        arguments = needed.among(config.arguments) | {"bounds": config.bounds or needed.bounds}
+    return make_batched(config.environment, **where, num_envs=count, observe=config.observe, **arguments)
 
 
 class TrainingVecEnv(VecEnvWrapper):
@@ -83,9 +85,10 @@ class TrainingVecEnv(VecEnvWrapper):
 def training_environment(config: TrainingConfig) -> VecNormalize:
     """The environment that Stable-Baselines3 trains on; only rewards are normalised by running statistics."""
     batched = build(config)
-    rows: KHopSB3VecEnv | ShieldedSB3VecEnv = KHopSB3VecEnv(batched)
+    inner = KHopSB3VecEnv(batched)
+    rows: KHopSB3VecEnv | ShieldedSB3VecEnv = inner
     if config.shield is not None:
-        rows = ShieldedSB3VecEnv(rows, config.shield, bounds=config.bounds)  # type: ignore[arg-type]
+        rows = ShieldedSB3VecEnv(inner, safety_filter(str(config.shield), None, config.bounds))
     scaler = ObservationScaler.of(described(batched, config), config.rates, config.nearest)
     wrapped = TrainingVecEnv(rows, scaler, config.huber)
     return VecNormalize(wrapped, norm_obs=False, norm_reward=True, gamma=config.gamma)
@@ -100,6 +103,6 @@ def described(batched: BatchedEnv, config: TrainingConfig) -> EnvDescription:
     found = describe(batched)
     if config.shield is None:
         return found
-    shield = SafetyFilter(None, config.shield, bounds=config.bounds)
+    shield = safety_filter(str(config.shield), None, config.bounds)
     shield.reset(found, [0])
     return shield.inside

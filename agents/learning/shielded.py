@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from agents.policy import describe
-from agents.safety import Margin, SafetyFilter
+from agents.safety import SafetyFilter
 from agents.safety.environments import space_of
 from khop_env.env.layout import Float32Array
 from khop_env.env.sb3 import KHopSB3VecEnv
@@ -18,12 +19,11 @@ from khop_env.env.sb3 import KHopSB3VecEnv
 class ShieldedSB3VecEnv(VecEnvWrapper):
     """`make_sb3_vec` with a safety filter that corrects actions before the environment gets them, as in `ShieldedEnv`.
 
-        env = ShieldedSB3VecEnv(make_sb3_vec("navigation_v0", num_envs=16, bounds=True))
+        env = ShieldedSB3VecEnv(make_sb3_vec("navigation_v0", num_envs=16, bounds=True), SafetyFilter(None))
 
     Args:
-        venv: made with bounds=True for margin="certified".
-        margin: of the filter.
-        options: of `SafetyFilter`: gamma, radius, bounds.
+        venv: the environment, as `filter` needs it.
+        filter: without a policy.
 
     Attributes:
         filter: the safety filter; `intervention` and `infeasible` of its last step are (B,) by agent. The infos of rows
@@ -33,19 +33,20 @@ class ShieldedSB3VecEnv(VecEnvWrapper):
         ValueError: if the filter doesn't fit the environment, or an option is out of range.
     """
 
-    def __init__(self, venv: KHopSB3VecEnv, margin: Margin = "certified", **options: Any) -> None:
-        self.filter, self.batched = SafetyFilter(None, margin, **options), venv.batched
+    def __init__(self, venv: KHopSB3VecEnv, filter: SafetyFilter) -> None:
+        self.filter, self.batched = filter, venv.batched
         described = describe(venv.batched)
         self.filter.reset(described, [0])
         self._agents, self._shape = described.agents, (venv.batched.num_envs, len(described.agents), -1)
-        super().__init__(venv, space_of(self.filter.inside.layouts[self._agents[0]]))
+        first, inside = self._agents[0], self.filter.inside  # uniform: the same for all
+        actions = Box(-1.0, 1.0, (inside.action_sizes[first],), np.float32)
+        super().__init__(venv, space_of(inside.layouts[first]), actions)
         self._rows: Float32Array = np.zeros((0, 0), np.float32)
 
     def reset(self) -> Float32Array:
         """Start new episodes; rows without bounds."""
         self._rows = np.asarray(self.venv.reset())
-        batch, agents, _ = self._shape
-        self.filter.set_state({"anchor": np.zeros((batch, agents, 2)), "started": np.zeros((batch, agents), np.bool_)})
+        self.filter.begin(self._shape[0])
         return self._seen(self._rows)
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -58,7 +59,7 @@ class ShieldedSB3VecEnv(VecEnvWrapper):
         if np.shape(actions) != expected:
             raise ValueError(f"actions must have shape {expected}; got {np.shape(actions)}")
         corrected = self.filter.correct(self._by_agent(self._rows), self._by_agent(np.asarray(actions)))
-        self.venv.step_async(np.stack(list(corrected.values()), axis=1).reshape(expected))
+        self.venv.step_async(np.stack(list(corrected.values()), axis=1).reshape(self.num_envs, -1))
 
     def step_wait(self) -> tuple[Float32Array, Float32Array, NDArray[np.bool_], list[dict[str, Any]]]:
         """Advance all rows by one control period."""
@@ -73,7 +74,7 @@ class ShieldedSB3VecEnv(VecEnvWrapper):
                 "intervention": float(self.filter.intervention[agent][env]),
                 "infeasible": bool(self.filter.infeasible[agent][env]),
             }
-        self.filter.restart(ended // len(self._agents))
+        self.filter.begin(self._shape[0], ended // len(self._agents))
         return self._seen(self._rows), np.asarray(rewards), np.asarray(dones), infos
 
     def get_state(self) -> dict[str, NDArray[Any]]:

@@ -33,8 +33,8 @@ from agents.learning.initial import begin_from
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
 from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, write
+from agents.policies import safety_filter
 from agents.policy import EnvDescription, Observations, Policy
-from agents.safety import SafetyFilter
 from khop_env.env.layout import Float32Array
 
 EVALUATION_SEEDS = range(20_000, 20_032)
@@ -246,7 +246,7 @@ class _Run(BaseCallback):
         policy = self._exported()
         played: Policy = _Stoppable(policy, self)
         if self.config.shield is not None:
-            played = SafetyFilter(played, self.config.shield, bounds=self.config.bounds)
+            played = safety_filter(str(self.config.shield), played, self.config.bounds)
         episodes = play(self.evaluation_env, played, EVALUATION_SEEDS, name=self.config.algorithm)
         found = Evaluation(
             self.algorithm.num_timesteps,

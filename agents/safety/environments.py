@@ -31,9 +31,9 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
     does the same to a policy's actions.
 
     Args:
-        env: made with bounds=True for margin="certified".
+        env: made with bounds=True for margin="certified", and with message_size=4 for announce=True.
         margin: of the filter.
-        options: of `SafetyFilter`: gamma, radius, bounds.
+        options: of `SafetyFilter`: gamma, announce, radius, bounds.
 
     Attributes:
         filter: the safety filter.
@@ -47,6 +47,9 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
         self._inner = env
         self.filter = SafetyFilter(None, margin, **options)
         self.filter.reset(describe(env), [0])
+        self.action_spaces = {
+            agent: Box(-1.0, 1.0, (size,), np.float32) for agent, size in self.filter.inside.action_sizes.items()
+        }
         self.observation_spaces = {agent: space_of(layout) for agent, layout in self.filter.inside.layouts.items()}
         self._seen_by_filter: dict[str, Float32Array] = {}
 
@@ -63,6 +66,11 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
         self.env.observation_space(agent)  # names those that aren't there
         return self.observation_spaces[agent]
 
+    def action_space(self, agent: str) -> Box:
+        """[-1, 1] per input, without what the filter sends; the same object at every call."""
+        self.env.action_space(agent)
+        return self.action_spaces[agent]
+
     def layout(self, agent: str) -> ObservationLayout:
         """Names, units and bounds of every column of this agent's observation."""
         self.env.observation_space(agent)
@@ -73,7 +81,7 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
     ) -> tuple[dict[str, Float32Array], Infos]:
         """Start a new episode, as the environment inside."""
         observations, infos = self.env.reset(seed=seed, options=options)
-        self.filter.restart(np.zeros(1, np.int64))
+        self.filter.begin(1)
         nothing = {"intervention": 0.0, "infeasible": False}
         return self._seen(observations), {agent: {**info, **nothing} for agent, info in infos.items()}
 

@@ -211,12 +211,12 @@ class SafetyFilter:
             batch: number of environments.
             env_ids: those in which they have begun; None for all.
         """
-        if env_ids is not None and len(self._started) == batch:
+        if env_ids is None:
+            shape = batch, len(self._env.agents)
+            self._anchor, self._started = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
+            self._resting = np.zeros(shape, np.int64)
+        elif len(self._started):
             self._started[env_ids], self._resting[env_ids] = False, 0
-            return
-        shape = batch, len(self._env.agents)
-        self._anchor, self._started = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
-        self._resting = np.zeros(shape, np.int64)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """A copy of what the filter remembers between actions."""

@@ -22,6 +22,7 @@ from khop_env.commands.common import (
     load,
     mistakes,
     print_json,
+    shielded_name,
     with_network,
 )
 from khop_env.commands.folders import folder_name
@@ -64,8 +65,9 @@ def train(
         typer.Option(
             "--shield",
             metavar="MARGIN",
-            help="Train inside a safety filter that corrects the actions: certified, none or so many metres. A policy "
-            "that was trained without it can be played inside all the same: --policies filter:ppo:FOLDER.",
+            help="Train inside a safety filter that corrects the actions: certified, none or so many metres; with "
+            "options, certified,announce=true. A policy that was trained without it can be played inside all the same: "
+            "--policies filter:ppo:FOLDER.",
         ),
     ] = None,
     initial: Annotated[
@@ -231,5 +233,5 @@ def _play(config: TrainingConfig, folder: Path) -> str:
         command += ["--env", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
     policy = f"{config.algorithm}:{folder}"
     if config.shield is not None:
-        policy = f"filter:{policy}" if config.shield == "certified" else f"filter:margin={config.shield}:{policy}"
+        policy = shielded_name(policy, str(config.shield))
     return shlex.join([*command, "--policies", policy])

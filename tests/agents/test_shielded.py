@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from agents import ShieldedEnv, describe, evaluate, make_policy, shielded
+from agents import SafetyFilter, ShieldedEnv, describe, evaluate, make_policy, shielded
 from agents.learning import LearnedPolicy, TrainingConfig
 from agents.learning.environment import training_environment
 from agents.learning.shielded import ShieldedSB3VecEnv
@@ -33,13 +33,14 @@ TINY = TrainingConfig(
 )
 
 
-def parallel(margin="certified", **arguments):
-    return ShieldedEnv(navigation_v0.parallel_env(**{"bounds": True, "max_cycles": 30, **arguments}), margin)
+def parallel(options=None, **arguments):
+    env = navigation_v0.parallel_env(**{"bounds": True, "max_cycles": 30, **arguments})
+    return ShieldedEnv(env, **(options or {}))
 
 
-def played(policy, cycles, seed):
+def played(policy, cycles, seed, message_size=0):
     """By control period: observations (N, D) with bounds, and interventions (N,) of a filtered policy."""
-    env = make_batched("navigation_v0", bounds=True, num_envs=1, max_cycles=30)
+    env = make_batched("navigation_v0", bounds=True, num_envs=1, max_cycles=30, message_size=message_size)
     policy.reset(describe(env), [0])
     observations, _ = env.reset(seed)
     found = []
@@ -50,11 +51,12 @@ def played(policy, cycles, seed):
     return found
 
 
-@pytest.mark.parametrize("margin", ["certified", "none", 0.1])
-def test_a_shielded_environment_does_what_the_filter_does_round_a_policy(margin):
+@pytest.mark.parametrize("options", [{}, {"margin": "none"}, {"margin": 0.1, "gamma": 0.5}, {"announce": True}])
+def test_a_shielded_environment_does_what_the_filter_does_round_a_policy(options):
     """Bit for bit, over an episode in which it has to intervene."""
-    expected = played(shielded("go_to_goal", margin), 30, 3)
-    env, learner = parallel(margin), make_policy("go_to_goal")
+    size = 4 if "announce" in options else 0
+    expected = played(shielded("go_to_goal", **options), 30, 3, size)
+    env, learner = parallel(options, message_size=size), make_policy("go_to_goal")
     observations, infos = env.reset(3)
     assert {info["intervention"] for info in infos.values()} == {0.0}
     learner.reset(env.filter.inside, [0])
@@ -73,7 +75,10 @@ def test_a_shielded_environment_does_what_the_filter_does_round_a_policy(margin)
 def test_rows_for_stable_baselines3_do_the_same():
     """Each environment of the batch, also after the ends of episodes, where the filter begins anew."""
     options = {"num_envs": 3, "bounds": True, "max_cycles": 12}
-    rows, env = ShieldedSB3VecEnv(make_sb3_vec("navigation_v0", **options)), make_batched("navigation_v0", **options)
+    rows, env = (
+        ShieldedSB3VecEnv(make_sb3_vec("navigation_v0", **options), SafetyFilter(None)),
+        make_batched("navigation_v0", **options),
+    )
     policy, learner = shielded("go_to_goal"), make_policy("go_to_goal")
     rows.seed(5)
     seen, agents = rows.reset(), env.agents
@@ -217,9 +222,9 @@ def test_a_resumed_training_keeps_the_shield(tmp_path):
 
 def test_shields_are_checked():
     """In words that name the setting, before there is a folder."""
-    with pytest.raises(ValueError, match=r"shield: margin must be 'certified', 'none' or a number of metres.*'safe'"):
+    with pytest.raises(ValueError, match=r"margin must be 'certified', 'none' or a number of metres.*'safe'"):
         dataclasses.replace(TINY, shield="safe")
-    assert dataclasses.replace(TINY, shield="0.3").shield == 0.3
+    assert dataclasses.replace(TINY, shield=0.3).shield == "0.3"
     with pytest.raises(ValueError, match="'cart_0' is a DoubleIntegrator"):
         training_environment(
             dataclasses.replace(TINY, environment="consensus_v0", scenario="mixed_fleet", arguments={})
