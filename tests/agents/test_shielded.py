@@ -72,14 +72,13 @@ def test_a_shielded_environment_does_what_the_filter_does_round_a_policy(options
     assert not any("bound" in name for name in env.layout(env.possible_agents[0]).names)
 
 
-def test_rows_for_stable_baselines3_do_the_same():
+@pytest.mark.parametrize("announce", [False, True])
+def test_rows_for_stable_baselines3_do_the_same(announce):
     """Each environment of the batch, also after the ends of episodes, where the filter begins anew."""
-    options = {"num_envs": 3, "bounds": True, "max_cycles": 12}
-    rows, env = (
-        ShieldedSB3VecEnv(make_sb3_vec("navigation_v0", **options), SafetyFilter(None)),
-        make_batched("navigation_v0", **options),
-    )
-    policy, learner = shielded("go_to_goal"), make_policy("go_to_goal")
+    options = {"num_envs": 3, "bounds": True, "max_cycles": 12, "message_size": 4 * announce}
+    rows = ShieldedSB3VecEnv(make_sb3_vec("navigation_v0", **options), SafetyFilter(None, announce=announce))
+    env = make_batched("navigation_v0", **options)
+    policy, learner = shielded("go_to_goal", announce=announce), make_policy("go_to_goal")
     rows.seed(5)
     seen, agents = rows.reset(), env.agents
     assert seen.shape == (24, *rows.observation_space.shape)
