@@ -9,7 +9,7 @@ from agents.leader_following import LeaderFollowingLaw
 from agents.lyapunov import ComparisonGain
 from agents.policies import POLICIES, make_policy, shielded
 from agents.policy import EnvDescription, Policy, describe
-from agents.safety import SafetyFilter
+from agents.safety import SafetyFilter, ShieldedEnv
 from agents.scripted import LawPolicy, RandomPolicy, ZeroPolicy
 from agents.set_iss import analytical_gain, injected_errors, swept_bounds
 from agents.stable_baselines import sb3_policy
@@ -32,6 +32,7 @@ __all__ = [
     "RandomPolicy",
     "Row",
     "SafetyFilter",
+    "ShieldedEnv",
     "TanhConsensus",
     "Tuned",
     "VelocityLaw",

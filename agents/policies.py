@@ -89,7 +89,7 @@ def make_policy(spec: str) -> Policy:
     known = {key: kind for key, kind in hints.items() if key != "return"}
     if argument and not known:
         raise ValueError(f"policy {spec!r}: {name!r} takes no parameters")
-    found = _options(spec, argument, known)
+    found = _options(argument, known, f"policy {spec!r}")
     try:
         return FLOOR[name](**found)
     except ValueError as error:
@@ -108,6 +108,22 @@ def shielded(policy: str | Policy, margin: Margin = "certified", **options: Any)
         ValueError: for an unknown policy, or an option out of range.
     """
     return SafetyFilter(make_policy(policy) if isinstance(policy, str) else policy, margin, **options)
+
+
+def safety_filter(shield: str, policy: Policy | None, bounds: bool | None = None) -> SafetyFilter:
+    """The safety filter that `--shield` means.
+
+    Args:
+        shield: a margin, and options of `SafetyFilter` after commas: "certified,announce=true".
+        policy: inside; None for a filter that only corrects actions.
+        bounds: whether the policy observes bounds; None as for `SafetyFilter`.
+
+    Raises:
+        ValueError: for a wrong margin or option.
+    """
+    margin, _, options = shield.partition(",")
+    found = {"bounds": bounds, **_options(options, FILTER_OPTIONS, f"shield {shield!r}")}
+    return SafetyFilter(policy, margin, **found)
 
 
 class Needs(NamedTuple):
@@ -141,7 +157,7 @@ def _filter(spec: str, argument: str) -> SafetyFilter:
     options, colon, inside = argument.partition(":")
     if "=" not in options:
         options, inside = "", argument
-    found = _options(spec, options, FILTER_OPTIONS)
+    found = _options(options, FILTER_OPTIONS, f"policy {spec!r}")
     if colon and not inside:
         raise ValueError(f"policy {spec!r}: expected {FILTER}:OPTION=VALUE,...:POLICY; there is no policy")
     try:
@@ -150,12 +166,12 @@ def _filter(spec: str, argument: str) -> SafetyFilter:
         raise ValueError(f"policy {spec!r}: {error}") from error
 
 
-def _options(spec: str, text: str, known: Mapping[str, Any]) -> dict[str, Any]:
+def _options(text: str, known: Mapping[str, Any], where: str) -> dict[str, Any]:
     """The options in a policy's name; `known` has their types."""
-    found = parameters_from_text(text, known, f"policy {spec!r}")
+    found = parameters_from_text(text, known, where)
     for key in found:
         if key not in known:
-            raise ValueError(f"policy {spec!r}: no option {key!r}; {did_you_mean(key, known)}")
+            raise ValueError(f"{where}: no option {key!r}; {did_you_mean(key, known)}")
     return found
 
 

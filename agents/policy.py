@@ -34,6 +34,7 @@ class EnvDescription:
         error_unit: unit of the task error.
         disturbance: bound on |w| of each acting agent by id, (n,) in state units per second.
         message_size: entries at the end of each agent's action that are sent with its messages.
+        shielded: whether a safety filter corrects the actions.
     """
 
     environment: str
@@ -46,6 +47,7 @@ class EnvDescription:
     error_unit: str = "m"
     disturbance: Mapping[str, FloatArray] = field(default_factory=dict)
     message_size: int = 0
+    shielded: bool = False
 
     __repr__ = brief
 

@@ -59,7 +59,10 @@ def main() -> None:
     for block in blocks:
         text += table(block)
     options.docs.mkdir(parents=True, exist_ok=True)
-    (options.docs / "learning.md").write_text("\n".join(text).rstrip() + "\n")
+    page = options.docs / "learning.md"
+    written = page.read_text(encoding="utf-8") if page.exists() else ""
+    by_hand = "".join(written.partition("\n## ")[1:])  # sections of this level stay
+    page.write_text("\n".join(text).rstrip() + "\n" + by_hand, encoding="utf-8")
     curves = {block.task.label: (block.timesteps, block.curves) for block in blocks}
     learning_curves(curves, options.docs / "learning.png")
     PRETRAINED.mkdir(exist_ok=True)

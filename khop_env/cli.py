@@ -11,8 +11,9 @@ import contextlib
 import inspect
 import os
 import sys
+import warnings
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -63,6 +64,7 @@ for name, command in COMMANDS.items():
 
 def main() -> None:
     """Run the command line; where stdout can't be written to, say so in one line, and not at all to a closed pipe."""
+    warnings.showwarning = _warn
     try:
         if warning := claim_agents():
             say(f"khop: {warning}")
@@ -79,6 +81,17 @@ def main() -> None:
         _drop_stdout()
         say(f"khop: {error}")
         raise SystemExit(2) from None
+
+
+_showwarning = warnings.showwarning
+
+
+def _warn(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+    """A warning meant for users in one line, others as Python shows them."""
+    if category is UserWarning:
+        say(f"khop: {message}")
+    else:
+        _showwarning(message, category, *where, **more)
 
 
 def _drop_stdout() -> None:

@@ -33,9 +33,12 @@ SLOW = tuple(
     for beginning in (
         # trainings
         "agents/test_evaluation.py::test_a_model_of_stable_baselines_plays",
+        "agents/test_initial.py",
         "agents/test_learned_policies.py",
         "agents/test_learning.py",
         "agents/test_resuming.py",
+        "agents/test_shielded.py::test_a_resumed_training",
+        "agents/test_shielded.py::test_a_training_inside",
         "env/test_integrations.py::TestSuperSuit::test_ppo",
         "env/test_sb3.py::test_ppo",
         # processes, one or more per test

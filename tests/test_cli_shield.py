@@ -85,6 +85,9 @@ def test_every_policy_of_an_evaluation_is_shielded(folder):
         (("run", "mixed_fleet", "--shield", "none"), "the safety filter is for integrators in the plane"),
         (("evaluate", *PLAYED, "--policies", "filter:margin=none:"), "expected filter:OPTION=VALUE,...:POLICY"),
         (("run", *PLAYED, "--shield", "certified", "--env", "bounds=false"), "with bounds=True"),
+        (("train", *PLAYED, "--shield", "safe"), "margin must be 'certified', 'none' or a number of metres"),
+        (("train", *PLAYED, "--shield", "certified,gama=1"), "no option 'gama'; did you mean 'gamma'?"),
+        (("train", *PLAYED, "--from", "nowhere"), "can't begin from nowhere: no policy file nowhere"),
     ],
 )
 def test_what_is_wrong_is_named(folder, arguments, message):

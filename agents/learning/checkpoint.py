@@ -16,7 +16,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.learning.archive import read_arrays, write_arrays
 
-FORMAT = 1
+FORMAT = 2
+_SEED = ("entropy", "spawn_key", "pool_size", "n_children_spawned")  # of a seed sequence, from which keys are spawned
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _LAST = ("_last_obs", "_last_episode_starts", "_last_original_obs")
 
@@ -59,8 +60,9 @@ def restored(template: Any, stored: Any, where: str) -> Any:
         ValueError: if keys, lengths, types or shapes differ; the message names the place.
     """
     if isinstance(template, np.random.Generator):
-        bits = type(template.bit_generator)()
-        bits.state = stored
+        seed = stored["seed"]
+        bits = type(template.bit_generator)(np.random.SeedSequence(**{name: seed[name] for name in _SEED}))
+        bits.state = stored["state"]
         return np.random.Generator(bits)
     if dataclasses.is_dataclass(template) and not isinstance(template, type):
         fields = {field.name: getattr(template, field.name) for field in dataclasses.fields(template)}
@@ -126,6 +128,16 @@ def restore_model(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
     random.setstate(stored["random"]["python"])
 
 
+def restore_networks(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
+    """Restore the networks of a saved model in a new one, but not what its optimizers remember.
+
+    Raises:
+        ValueError: if `stored` doesn't fit the model.
+    """
+    own = _arrays(dict(model.policy.state_dict()))
+    model.policy.load_state_dict(_tensors(restored(own, dict(stored["parameters"]["policy"]), "networks")))
+
+
 def _optimizer_state(optimizer: torch.optim.Optimizer, stored: Any, where: str) -> dict[str, Any]:
     """The stored state after checks, which `load_state_dict` doesn't make."""
     groups = restored(optimizer.state_dict()["param_groups"], stored["param_groups"], f"{where}.param_groups")
@@ -146,7 +158,8 @@ def _encoded(value: Any, arrays: list[np.ndarray]) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.random.Generator):
-        return _encoded(value.bit_generator.state, arrays)
+        bits, seed = value.bit_generator, value.bit_generator.seed_seq
+        return _encoded({"state": bits.state, "seed": {name: getattr(seed, name) for name in _SEED}}, arrays)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _encoded({field.name: getattr(value, field.name) for field in dataclasses.fields(value)}, arrays)
     if isinstance(value, Mapping):

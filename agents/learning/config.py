@@ -18,10 +18,20 @@ from khop_env.simulation import OBSERVE, Observe
 Algorithm = Literal["ppo", "sac"]
 ALGORITHMS = ("ppo", "sac")
 
+SUITED: Mapping[str, Mapping[str, Any]] = {
+    "sac": {"learning_rate": 1e-3, "batch_size": 512},
+    "navigation_v0": {
+        "nearest": True,
+        "hidden": (128, 128),
+        "arguments": {"penalty": 0.5},
+    },
+}
+"""By algorithm and environment: settings where others than the defaults suit it."""
+
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """All settings of a training run; the defaults work for every task of the library.
+    """All settings of a training run; `TrainingConfig.suited` has better ones than these defaults for some tasks.
 
     Attributes:
         environment: name of an environment (khop list), or a task of your own.
@@ -29,6 +39,11 @@ class TrainingConfig:
         observe: states of agents beyond the neighbours: "estimate", "oracle" or "local".
         bounds: whether observations hold the guaranteed bounds.
         rates: whether networks get how fast positions change, too, as differences of observations.
+        nearest: whether networks get other agents in the order of their distances, and not in that of the slots.
+        shield: a safety filter that corrects actions before the environment gets them: its margin, "certified", "none"
+            or a number of m, and options after commas, "certified,announce=true"; None for no filter.
+        initial: folder of another run, of which policy, value function and exploration are taken on, or a policy's
+            file; None for random networks.
         algorithm: learning algorithm, "ppo" or "sac".
         per_type: a network for each type of agent instead of one for all.
         timesteps: agent-steps in all, of all copies together.
@@ -57,6 +72,9 @@ class TrainingConfig:
     observe: Observe = "estimate"
     bounds: bool = False
     rates: bool = True
+    nearest: bool = False
+    shield: str | float | None = None
+    initial: str | None = None
     algorithm: Algorithm = "ppo"
     per_type: bool = False
     timesteps: int = 2_000_000
@@ -79,6 +97,11 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         object.__setattr__(self, "arguments", dict(self.arguments))
+        if self.shield is not None:
+            from agents.policies import safety_filter  # which itself imports the learned policies
+
+            object.__setattr__(self, "shield", str(self.shield))
+            safety_filter(str(self.shield), None)
         for name in ("observe", "bounds", "num_envs", "scenario"):
             if name in self.arguments:
                 raise ValueError(f"arguments: {name!r} is a setting of its own, {name}={self.arguments[name]!r}")
@@ -106,6 +129,22 @@ class TrainingConfig:
         for name in ("gamma", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be from 0 to 1; got {getattr(self, name)!r}")
+
+    @classmethod
+    def suited(cls, environment: Environment, **settings: Any) -> TrainingConfig:
+        """Settings with defaults that suit environment and algorithm, as `khop train` has them.
+
+        Args:
+            environment: as for the class.
+            settings: of the class; they win over these defaults.
+
+        Raises:
+            ValueError: as the class.
+        """
+        own = SUITED.get(environment, {}) if isinstance(environment, str) else {}
+        found = {**SUITED.get(str(settings.get("algorithm")), {}), **own, **settings}
+        arguments = {**own.get("arguments", {}), **settings.get("arguments", {})}
+        return cls(environment, **{**found, "arguments": arguments})
 
     def as_dict(self) -> dict[str, Any]:
         """The settings as JSON values; environment and scenario by name."""

@@ -11,7 +11,9 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from agents.learning.config import TrainingConfig
 from agents.learning.scaling import MOST, ObservationScaler
-from agents.policy import describe
+from agents.learning.shielded import ShieldedSB3VecEnv
+from agents.policies import needs, safety_filter
+from agents.policy import EnvDescription, describe
 from khop_env.env import BatchedEnv
 from khop_env.env.layout import Float32Array
 from khop_env.env.sb3 import KHopSB3VecEnv
@@ -30,8 +32,11 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
     """
     where = {} if config.scenario is None else {"scenario": config.scenario}
     count = config.num_envs if num_envs is None else num_envs
-    of_config: dict[str, Any] = {"observe": config.observe, "bounds": config.bounds}
-    return make_batched(config.environment, **where, num_envs=count, **of_config, **config.arguments)
+    arguments: dict[str, Any] = {"bounds": config.bounds, **config.arguments}
+    if config.shield is not None:  # the learner doesn't get what the filter needs
+        needed = needs(safety_filter(str(config.shield), None))
+        arguments = needed.among(config.arguments) | {"bounds": config.bounds or needed.bounds}
+    return make_batched(config.environment, **where, num_envs=count, observe=config.observe, **arguments)
 
 
 class TrainingVecEnv(VecEnvWrapper):
@@ -45,9 +50,11 @@ class TrainingVecEnv(VecEnvWrapper):
         huber: error above which rewards are linear in it, in the unit of the task error.
     """
 
-    def __init__(self, venv: KHopSB3VecEnv, scaler: ObservationScaler, huber: float) -> None:
+    def __init__(self, venv: KHopSB3VecEnv | ShieldedSB3VecEnv, scaler: ObservationScaler, huber: float) -> None:
         super().__init__(venv, Box(-MOST, MOST, (scaler.size,), np.float32))
-        self.batched, self.source, self.scaler, self._huber = venv.batched, venv, scaler, huber
+        self.batched, self.scaler, self._huber = venv.batched, scaler, huber
+        self.shield = venv if isinstance(venv, ShieldedSB3VecEnv) else None
+        self.source: KHopSB3VecEnv = venv.venv if isinstance(venv, ShieldedSB3VecEnv) else venv  # type: ignore[assignment]
         self.before = np.zeros(0, np.float32)  # observations of the previous step
 
     def reset(self) -> Float32Array:
@@ -78,6 +85,24 @@ class TrainingVecEnv(VecEnvWrapper):
 def training_environment(config: TrainingConfig) -> VecNormalize:
     """The environment that Stable-Baselines3 trains on; only rewards are normalised by running statistics."""
     batched = build(config)
-    scaler = ObservationScaler.of(describe(batched), config.rates)
-    wrapped = TrainingVecEnv(KHopSB3VecEnv(batched), scaler, config.huber)
+    inner = KHopSB3VecEnv(batched)
+    rows: KHopSB3VecEnv | ShieldedSB3VecEnv = inner
+    if config.shield is not None:
+        rows = ShieldedSB3VecEnv(inner, safety_filter(str(config.shield), None, config.bounds))
+    scaler = ObservationScaler.of(described(batched, config), config.rates, config.nearest)
+    wrapped = TrainingVecEnv(rows, scaler, config.huber)
     return VecNormalize(wrapped, norm_obs=False, norm_reward=True, gamma=config.gamma)
+
+
+def described(batched: BatchedEnv, config: TrainingConfig) -> EnvDescription:
+    """An environment that `build` made, as the learner gets it.
+
+    Raises:
+        ValueError: if the safety filter, where there is to be one, doesn't fit it.
+    """
+    found = describe(batched)
+    if config.shield is None:
+        return found
+    shield = safety_filter(str(config.shield), None, config.bounds)
+    shield.reset(found, [0])
+    return shield.inside

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -49,6 +50,9 @@ class LearnedPolicy:
 
         Raises:
             PolicyFileError: if it doesn't; the message says what differs.
+
+        Warns:
+            UserWarning: if it was trained in a safety filter and is played without one.
         """
         if env.environment != self.environment:
             raise PolicyFileError(f"it was trained for {self.environment}, not for {env.environment}")
@@ -79,6 +83,13 @@ class LearnedPolicy:
         types = {model.type for model in env.models.values()}
         if "" not in self.networks and (missing := types - set(self.networks)):
             raise PolicyFileError(f"it has no network for agents of type {', '.join(sorted(missing))}")
+        margin = self.about.get("shield")
+        if margin is not None and not env.shielded:
+            warnings.warn(
+                f"a policy trained inside the safety filter is played outside of it, where agents may collide: put "
+                f"filter:margin={margin}: before its name, or use --shield {margin}",
+                stacklevel=1,  # this line, so that it is said once
+            )
         self._types, self._before = {agent: model.type for agent, model in env.models.items()}, None
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:

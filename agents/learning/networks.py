@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -159,11 +159,9 @@ def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers
         types: names of the agent types, in the order of the one-hot.
     """
     policy: Any = model.policy
-    if isinstance(model, SAC):
-        return {"": _layers([*policy.actor.latent_pi, policy.actor.mu])}
+    if isinstance(model, SAC) or not isinstance(policy.mlp_extractor, PerTypeExtractor):
+        return {"": _layers(_actor(model))}
     extractor, head = policy.mlp_extractor, policy.action_net
-    if not isinstance(extractor, PerTypeExtractor):
-        return {"": _layers([*extractor.policy_net, head])}
     networks = {}
     weight, bias = (parameter.detach().numpy().copy() for parameter in (head.weight, head.bias))
     width = weight.shape[1] // len(types)
@@ -171,6 +169,29 @@ def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers
         block = weight[:, number * width : (number + 1) * width]
         networks[kind] = (*_layers(extractor.actors[number]), (block[:, :-1].copy(), bias + block[:, -1]))
     return networks
+
+
+def load_actor(model: BaseAlgorithm, networks: Mapping[str, Layers]) -> None:
+    """Give a model with one network for all agents the actor that `actor_layers` returned, of the same shapes.
+
+    Raises:
+        ValueError: for networks by type, of which a file has too little.
+    """
+    if "" not in networks:
+        raise ValueError("a policy's file with a network for each type isn't enough: name the folder of its run")
+    linear = [layer for layer in _actor(model) if isinstance(layer, nn.Linear)]
+    with torch.no_grad():
+        for layer, (weight, bias) in zip(linear, networks[""], strict=True):
+            layer.weight.copy_(torch.as_tensor(weight))
+            layer.bias.copy_(torch.as_tensor(bias))
+
+
+def _actor(model: BaseAlgorithm) -> list[nn.Module]:
+    """The modules from features to the action's mean, of a model with one network for all agents."""
+    policy: Any = model.policy
+    if isinstance(model, SAC):
+        return [*policy.actor.latent_pi, policy.actor.mu]
+    return [*policy.mlp_extractor.policy_net, policy.action_net]
 
 
 def exported(

@@ -17,7 +17,8 @@ from khop_env.env.layout import Float32Array
 
 FORMAT = 1
 MOST_BYTES = 2**28  # limit on a policy's arrays; the shipped policies have less than a thousandth of it
-_INDICES = ("valid", "moving", "headed", "heading", "planar")
+_INDICES = ("valid", "moving", "headed", "heading", "planar", "slots", "places")
+_TABLES = ("planar", "slots", "places")  # of two dimensions
 _ABOUT = {"algorithm": str, "environment": str, "scenario": str, "bounds": bool}
 
 Layers = tuple[tuple[Float32Array, Float32Array], ...]
@@ -105,14 +106,17 @@ def _scaler(arrays: Mapping[str, np.ndarray], columns: int) -> ObservationScaler
     limits = {"valid": columns + 1, "planar": columns + moving}
     found = {}
     for name in _INDICES:
-        index, limit = arrays[name], limits.get(name, columns)
-        _require(index.dtype == np.int64 and index.ndim == (2 if name == "planar" else 1), f"{name} isn't an index")
+        missing = np.zeros((0, 0), np.int64) if name in ("slots", "places") else None  # in files of earlier versions
+        index, limit = arrays[name] if missing is None else arrays.get(name, missing), limits.get(name, columns)
+        _require(index.dtype == np.int64 and index.ndim == 1 + (name in _TABLES), f"{name} isn't an index")
         _require(bool(np.all((index >= 0) & (index < limit))), f"{name} is out of range")
         found[name] = index
     headed, planar = len(found["headed"]), found["planar"]
     _require(len(found["valid"]) == columns, "valid has the wrong length")
     _require(len(found["heading"]) == (2 if headed else 0), "heading isn't a pair of columns")
     _require(planar.shape[1] == 2 and (headed > 0 or not len(planar)), "planar doesn't hold pairs")
+    _require(len(found["slots"]) == len(found["places"]), "slots and places have different lengths")
+    _require(found["places"].shape[1] > 0 or not len(found["places"]), "places has no columns")
     return ObservationScaler(scale=scale, rate=float(rate), **found)
 
 

@@ -37,6 +37,9 @@ class ObservationScaler:
         headed: (H,) one-hot columns of the agent types with a heading; empty if there are none.
         heading: (2,) columns of the heading's cosine and sine.
         planar: (K, 2) pairs of features that are rotated into the agent's own frame.
+        slots: (S, C) columns of each slot, if slots are put in the order of their distances, the nearest first; empty
+            if they stay in the observation's order.
+        places: (S, d) columns of the slots' positions; likewise.
     """
 
     scale: Float32Array
@@ -46,14 +49,17 @@ class ObservationScaler:
     headed: NDArray[np.int64]
     heading: NDArray[np.int64]
     planar: NDArray[np.int64]
+    slots: NDArray[np.int64]
+    places: NDArray[np.int64]
 
     @classmethod
-    def of(cls, env: EnvDescription, rates: bool) -> ObservationScaler:
+    def of(cls, env: EnvDescription, rates: bool, nearest: bool = False) -> ObservationScaler:
         """The scaler of an environment, with scales by unit.
 
         Args:
             env: description of an environment with uniform observations.
             rates: whether features include rates of change.
+            nearest: whether slots are ordered by distance.
 
         Raises:
             ValueError: if own positions are in different columns for different agents.
@@ -82,6 +88,7 @@ class ObservationScaler:
             headed,
             heading,
             np.array(planar, np.int64).reshape(-1, 2),
+            *_slots(names, len(own) if nearest else 0),
         )
 
     @property
@@ -96,6 +103,8 @@ class ObservationScaler:
             observations: (..., D).
             before: (..., D) one control period earlier; None at the beginning of an episode, where rates are 0.
         """
+        if len(self.slots):
+            observations, before = self._ordered(observations, before)
         shape = observations.shape[:-1]
         features = np.zeros((*shape, self.size), np.float32)
         columns = len(self.scale)
@@ -118,6 +127,29 @@ class ObservationScaler:
             features[..., self.planar[:, 0]] = cos * x + sin * y
             features[..., self.planar[:, 1]] = cos * y - sin * x
         return features
+
+    def _ordered(
+        self, observations: Float32Array, before: Float32Array | None
+    ) -> tuple[Float32Array, Float32Array | None]:
+        """Both, with the slots in the order of the distances of the first."""
+        known = observations[..., self.valid[self.places[:, 0]]] > 0.5
+        distance = np.where(known, np.square(observations[..., self.places]).sum(axis=-1), np.inf)
+        order = self.slots[np.argsort(distance, axis=-1, kind="stable")].reshape(*observations.shape[:-1], -1)
+
+        def ordered(values: Float32Array) -> Float32Array:
+            found = values.copy()
+            found[..., self.slots.reshape(-1)] = np.take_along_axis(values, order, axis=-1)
+            return found
+
+        return ordered(observations), None if before is None else ordered(before)
+
+
+def _slots(names: Sequence[str], dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns (S, C) of each slot and (S, dim) of its position; none without axes."""
+    count = sum(name.endswith(".valid") for name in names) if dim else 0
+    slots = [[column for column, name in enumerate(names) if name.startswith(f"slot{q}.")] for q in range(count)]
+    places = [[names.index(f"slot{q}.position.{axis}") for axis in axis_names(dim)] for q in range(count)]
+    return np.array(slots, np.int64).reshape(count, -1 if count else 0), np.array(places, np.int64).reshape(count, dim)
 
 
 def _vectors(names: Sequence[str], dim: int, *kinds: str) -> list[int]:

@@ -27,12 +27,14 @@ from agents.evaluation import chosen_scenario, play
 from agents.learning.checkpoint import CheckpointError, model_state, restore_model, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
 from agents.learning.config_file import write_config
-from agents.learning.environment import TrainingVecEnv, build, training_environment
+from agents.learning.environment import TrainingVecEnv, build, described, training_environment
 from agents.learning.fingerprint import differences, fingerprint
+from agents.learning.initial import begin_from
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
 from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, write
-from agents.policy import EnvDescription, Observations, Policy, describe
+from agents.policies import safety_filter
+from agents.policy import EnvDescription, Observations, Policy
 from khop_env.env.layout import Float32Array
 
 EVALUATION_SEEDS = range(20_000, 20_032)
@@ -149,9 +151,9 @@ class _Run(BaseCallback):
                 "train in another folder"
             )
         self.evaluation_env = build(config, len(EVALUATION_SEEDS))
-        self.description = describe(batched)
+        self.description = described(batched, config)
         self.types = list(dict.fromkeys(model.type for model in batched.fleet.models))
-        layout = batched.layouts[0]  # the first features are the observation's columns
+        layout = self.description.layouts[batched.agents[0]]  # the first features are the observation's columns
         columns = [layout.index(f"own.type.{kind}") for kind in self.types]
         log = None if folder is None else str(folder / "tensorboard")
         self.interrupted, self.resumed = False, saved is not None
@@ -161,6 +163,8 @@ class _Run(BaseCallback):
         self.seconds = 0.0
         if saved is not None:
             self._restore(saved)
+        elif config.initial is not None:
+            begin_from(config.initial, self.algorithm, self._exported(), self.description)
         self.best = max((point.mean_return for point in self.curve), default=-np.inf)
         self.policy = self._exported()
         for name in model_state(self.algorithm)["parameters"]:
@@ -240,7 +244,10 @@ class _Run(BaseCallback):
         if self.curve and self.curve[-1].timesteps == self.algorithm.num_timesteps:
             return
         policy = self._exported()
-        episodes = play(self.evaluation_env, _Stoppable(policy, self), EVALUATION_SEEDS, name=self.config.algorithm)
+        played: Policy = _Stoppable(policy, self)
+        if self.config.shield is not None:
+            played = safety_filter(str(self.config.shield), played, self.config.bounds)
+        episodes = play(self.evaluation_env, played, EVALUATION_SEEDS, name=self.config.algorithm)
         found = Evaluation(
             self.algorithm.num_timesteps,
             float(episodes.returns.mean()),
@@ -295,6 +302,7 @@ class _Run(BaseCallback):
             "environment": self.batched.get_state(),
             "rewards": {name: getattr(self.env.ret_rms, name) for name in _RUNNING} | {"returns": self.env.returns},
             "before": self.learner.before,
+            "shield": None if self.learner.shield is None else self.learner.shield.get_state(),
             "curve": self.curve,
             "seconds": self.elapsed(),
         }
@@ -309,6 +317,8 @@ class _Run(BaseCallback):
             self.env.reset()
             self.batched.set_state(restored(self.batched.get_state(), saved["environment"], "environment"))
             self.learner.before = restored(self.learner.before, saved["before"], "before")
+            if (shield := self.learner.shield) is not None:
+                shield.set_state(restored(shield.get_state(), saved["shield"], "shield"))
             rewards, running = saved["rewards"], self.env.ret_rms
             if not all(np.shape(rewards[name]) == () and np.isfinite(rewards[name]) for name in _RUNNING):
                 raise ValueError("the running statistics of the rewards aren't finite")

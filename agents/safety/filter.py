@@ -6,10 +6,12 @@ docs/theory_safety.md has the theorem, its assumptions, and what is measured onl
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.others import Others, side_by_side
@@ -17,7 +19,7 @@ from agents.policy import EnvDescription, Observations, Policy
 from agents.safety.columns import ANNOUNCED, Margin, read_columns, without_bounds
 from agents.safety.moves import filter_moves, periods_of_rest
 from khop_env.env.layout import Float32Array
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import SingleIntegrator
 
 
@@ -49,7 +51,8 @@ class SafetyFilter:
     provided that all agents run the filter and start apart (docs/theory_safety.md); with other margins it is not.
 
     Args:
-        policy: the policy inside; it gets the observations without bounds, unless it was trained with them.
+        policy: the policy inside; it gets the observations without bounds, unless it was trained with them. None for a
+            filter that only corrects actions that it is given.
         margin: a `Margin`.
         gamma: share of the gap that two agents may use up in a period together, above 0 and at most 1.
         announce: whether agents send their anchors in messages, so that neither disturbances nor noise widen the boxes.
@@ -63,10 +66,11 @@ class SafetyFilter:
 
     Attributes:
         policy: the policy inside.
+        inside: description of the environment as the policy inside gets it, from the reset on.
         needs_bounds: whether the environment must be made with bounds=True.
         needs_messages: the least message_size of the environment; the last of these numbers are the filter's.
-        wanted: by agent (..., m), the actions of the policy inside, of the last `act`.
-        correction: by agent (..., 2), chosen less wanted input in m/s, of the last `act`.
+        wanted: by agent (..., m), the actions of the policy inside, of the last `act` or `correct`.
+        correction: by agent (..., 2), chosen less wanted input in m/s, of the last one.
         intervention: by agent (...), its length.
         infeasible: by agent (...), True where the guarantee had to be begun anew: an agent that isn't where its last
             input should have brought it, which then starts from where it is, or that is outside of what observations
@@ -78,7 +82,7 @@ class SafetyFilter:
 
     def __init__(
         self,
-        policy: Policy,
+        policy: Policy | None,
         margin: Margin = "certified",
         *,
         gamma: float = 1.0,
@@ -91,7 +95,8 @@ class SafetyFilter:
             raise ValueError(f"gamma must be above 0 and at most 1; got {gamma!r}")
         if radius is not None and not 0.0 < radius < math.inf:
             raise ValueError(f"radius must be a positive number of metres; got {radius!r}")
-        self.policy, self.margin, self.gamma = policy, as_margin(margin), float(gamma)
+        self.policy: Policy = _NoPolicy() if policy is None else policy
+        self.margin, self.gamma = as_margin(margin), float(gamma)
         if announce and self.margin != "certified":
             raise ValueError(f"announce=True is for margin='certified'; got margin={margin!r}")
         self.announce, self.needs_messages = bool(announce), ANNOUNCED if announce else 0
@@ -125,22 +130,44 @@ class SafetyFilter:
         self._speed, self._own, self._scale = columns.speed, columns.own, columns.scale
         models = enumerate(env.models.values())
         self._drifting = {number: model for number, model in models if not isinstance(model, SingleIntegrator)}
-        self._begin(0)
+        self.begin(0)
         self._kept, inside = without_bounds(env, self._observes_bounds(env), self.needs_messages)
+        self.inside = replace(inside, shielded=True)
         self._sizes = inside.action_sizes
-        self.policy.reset(inside, seeds)
+        self.policy.reset(self.inside, seeds)
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """The policy's actions where they are safe, otherwise the nearest safe ones; once in a control period.
 
         Raises:
-            ValueError: if the policy inside leaves an agent out, or the batch has changed since the reset.
+            ValueError: if there is no policy inside, it leaves an agent out, or the batch has changed since the reset.
+        """
+        return self.correct(observations, self.policy.act(self.seen(observations)))
+
+    def seen(self, observations: Observations) -> Observations:
+        """What the policy inside, or a learner, gets of observations: those that `inside` describes."""
+        if not self._kept:
+            return observations
+        return {agent: np.asarray(observations[agent])[..., self._kept[agent]] for agent in observations}
+
+    def correct(self, observations: Observations, actions: Mapping[str, ArrayLike]) -> dict[str, Float32Array]:
+        """Actions where they are safe, otherwise the nearest safe ones; once in a control period.
+
+        Args:
+            observations: (..., D_i) by agent, of the environment that the filter was reset for.
+            actions: (..., m_i) by agent, as `inside` describes them.
+
+        Raises:
+            ValueError: if an agent's action is missing or of another shape, or the batch has changed since the reset.
         """
         agents, shape = self._env.agents, next(iter(observations.values())).shape[:-1]
-        seen = observations
-        if self._kept:
-            seen = {agent: np.asarray(observations[agent])[..., self._kept[agent]] for agent in observations}
-        self.wanted = self.policy.act(seen)
+        for agent, layout in self._env.layouts.items():
+            if observations[agent].shape[-1] != len(layout):
+                raise ValueError(
+                    f"the safety filter reads the {len(layout)} columns of {agent!r} in the environment that it was "
+                    f"reset for; it got {observations[agent].shape[-1]}"
+                )
+        self.wanted = {agent: _numbers(agent, action) for agent, action in actions.items()}
         flat = side_by_side(observations, agents)
         if self._others is not None:
             self._others.update(flat)
@@ -149,7 +176,7 @@ class SafetyFilter:
         if self._started.shape[0] != batch:
             if self._started.size:
                 raise ValueError(f"the batch of observations changed from {len(self._started)} to {batch}: reset first")
-            self._begin(batch)
+            self.begin(batch)
         fractions = np.stack([self._wanted(agent, batch) for agent in agents], axis=1)
         speed = self._speed
         wanted = np.clip(fractions, -1.0, 1.0, dtype=np.float64) * speed
@@ -170,37 +197,53 @@ class SafetyFilter:
         correction = chosen - wanted
         change = np.linalg.norm(correction, axis=2)
         safe = np.where((change > 0.0)[..., None], chosen / speed, fractions).astype(np.float32)
-        actions = {}
+        corrected = {}
         for number, agent in enumerate(agents):
             action = np.zeros((batch, self._env.action_sizes[agent]), np.float32)
-            action[:, : self._sizes[agent]] = np.asarray(self.wanted[agent], np.float32).reshape(batch, -1)
+            action[:, : self._sizes[agent]] = self.wanted[agent].reshape(batch, -1)
             action[:, :2] = safe[:, number]
             if self.announce:
                 anchor = self._anchor[:, number] / self._scale
                 action[:, -ANNOUNCED:-2] = anchor
                 action[:, -2] = self._started[:, number] & (np.abs(anchor) < 1.0).all(axis=1)
                 action[:, -1] = self._resting[:, number] == periods_of_rest(self._env.control_period)
-            actions[agent] = action.reshape(*shape, -1)
+            corrected[agent] = action.reshape(*shape, -1)
             self.correction[agent] = correction[:, number].reshape(*shape, 2)
             self.intervention[agent] = change[:, number].reshape(shape)
             self.infeasible[agent] = infeasible[:, number].reshape(shape)
-        return actions
+        return corrected
 
-    def _begin(self, batch: int) -> None:
-        """No agent has an anchor."""
-        shape = batch, len(self._env.agents)
-        self._anchor, self._started = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
-        self._resting = np.zeros(shape, np.int64)
+    def begin(self, batch: int, env_ids: IntArray | None = None) -> None:
+        """New episodes have begun: no agent has an anchor.
+
+        Args:
+            batch: number of environments.
+            env_ids: those in which they have begun; None for all.
+        """
+        if env_ids is None:
+            shape = batch, len(self._env.agents)
+            self._anchor, self._started = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
+            self._resting = np.zeros(shape, np.int64)
+        elif len(self._started):
+            self._started[env_ids], self._resting[env_ids] = False, 0
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """A copy of what the filter remembers between actions."""
+        return {"anchor": self._anchor.copy(), "started": self._started.copy(), "resting": self._resting.copy()}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from `get_state()`'s result, after a reset in the same environment."""
+        self._anchor, self._started, self._resting = (state[name].copy() for name in ("anchor", "started", "resting"))
 
     def _wanted(self, agent: str, batch: int) -> Float32Array:
         """(B, 2) what the policy inside wants of an agent."""
         if agent not in self.wanted:
-            raise ValueError(f"the policy inside the safety filter has no action for {agent!r}")
-        wanted, expected = np.asarray(self.wanted[agent], np.float32), (batch, self._sizes[agent])
+            raise ValueError(f"the safety filter got no action for {agent!r}")
+        wanted, expected = self.wanted[agent], (batch, self._sizes[agent])
         if wanted.size != batch * expected[1]:
             raise ValueError(
-                f"actions of {agent!r} must have shape {expected}, one row per environment; the policy inside the "
-                f"safety filter gave {wanted.shape}"
+                f"actions of {agent!r} must have shape {expected}, one row per environment; the safety filter got "
+                f"{wanted.shape}"
             )
         return wanted.reshape(expected)[:, :2]
 
@@ -239,3 +282,23 @@ def _held(env: EnvDescription) -> Others:
             "(their estimates are predictions)"
         )
     return others
+
+
+def _numbers(agent: str, action: ArrayLike) -> Float32Array:
+    try:
+        return np.asarray(action, np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"the action of {agent!r} isn't numbers: {action!r}") from None
+
+
+class _NoPolicy:
+    """Inside a filter that only corrects actions that it is given."""
+
+    def __repr__(self) -> str:
+        return "None"
+
+    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
+        """Nothing to prepare."""
+
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        raise ValueError("there is no policy inside the safety filter: give it one, or call correct() with actions")

@@ -208,12 +208,12 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
                 f"{seen['min_distance']:.3f}",
                 "" if filtered is None else f"{filtered:.3f}",
                 *["" if filtered is None else f"{100.0 * seen['infeasible']:.2g}"] * began_anew,
-                _with_interval(seen["mean_return"], seen["ci95"]),
+                f"{seen['mean_return']:.2f}" + ("" if seen["ci95"] is None else f"\n±{seen['ci95']:.2f}"),
                 f"{seen['max_error_to_bound']:.3f}",
             )
         )
     header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)")
-    print_table((*header, *["infeasible %"] * began_anew, "return", "e / bound"), rows, title)
+    print_table((*header, *["infeasible %"] * began_anew, "return", "e / bound"), rows, title, whole=header[1:4])
     infeasible = "infeasible: share of agents and time in which a filter's guarantee had to be begun anew; "
     print_text(
         "collided: episodes with a collision; success: all at their goals at the end, without any collision; deadlock: "
@@ -226,8 +226,9 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
 
 
 def _rate(rate: float, interval: list[float]) -> str:
-    low, high = interval
-    return f"{100.0 * rate:.3g} [{100.0 * low:.2g}, {100.0 * high:.3g}]"
+    """In %, with its interval below."""
+    low, high = (f"{100.0 * end:.0f}" if end > 0.095 else f"{100.0 * end:.2g}" for end in interval)
+    return f"{100.0 * rate:.3g}\n[{low}, {high}]"
 
 
 def _name(row: Row, comparison: Comparison) -> str:

@@ -22,6 +22,7 @@ from khop_env.commands.common import (
     load,
     mistakes,
     print_json,
+    shielded_name,
     with_network,
 )
 from khop_env.commands.folders import folder_name
@@ -31,8 +32,6 @@ from khop_env.terminal import Progress, print_text, say, waiting
 if TYPE_CHECKING:
     from agents.learning import TrainingConfig
     from agents.learning.training import Evaluation
-
-_OF_SAC = {"learning_rate": 1e-3, "batch_size": 512}  # where these settings aren't chosen
 
 
 class AlgorithmOption(enum.StrEnum):
@@ -61,6 +60,25 @@ def train(
     ] = None,
     network: NetworkOption = None,
     estimator: EstimatorOption = None,
+    shield: Annotated[
+        str | None,
+        typer.Option(
+            "--shield",
+            metavar="MARGIN",
+            help="Train inside a safety filter that corrects the actions: certified, none or so many metres; with "
+            "options, certified,announce=true. A policy that was trained without it can be played inside all the same: "
+            "--policies filter:ppo:FOLDER.",
+        ),
+    ] = None,
+    initial: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="RUN",
+            help="Begin with the networks of another run: its folder, or a policy's file. Observations and networks "
+            "have to be the same; reward, shield and scenario may differ.",
+        ),
+    ] = None,
     algo: Annotated[AlgorithmOption | None, typer.Option(help="Algorithm; by default ppo.")] = None,
     per_type: Annotated[bool | None, typer.Option("--per-type", help="One network for each type of agent.")] = None,
     timesteps: Annotated[
@@ -105,6 +123,8 @@ def train(
         "scenario": scenario,
         "observe": observe and observe.value,
         "bounds": bounds,
+        "shield": shield,
+        "initial": initial,
         "algorithm": algo and algo.value,
         "per_type": per_type,
         "timesteps": timesteps,
@@ -116,12 +136,11 @@ def train(
             from agents.learning.training import train
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(f"training needs {error.name}: {how_to_install('rl')}") from error
-        from agents.learning.environment import build
-        from agents.policy import describe
+        from agents.learning.environment import build, described
 
         set_by_options = {name: value for name, value in options.items() if value is not None}
         chosen = _chosen(config, settings or [], set_by_options, env or [], (network, estimator))
-        played = describe(build(chosen, 1))  # refuses what doesn't fit before there is a folder
+        played = described(build(chosen, 1), chosen)  # refuses what doesn't fit before there is a folder
         unit = played.error_unit
         folder = out or Path("runs") / "train" / _folder(chosen, played.environment)
     label = f"training {chosen.environment} on {chosen.observe}"
@@ -192,11 +211,12 @@ def _chosen(
         )
     if found.get("scenario") is not None:
         load(found["scenario"])  # refuses one with a law that there isn't, as every command does
-    return TrainingConfig(**({**_OF_SAC, **found} if found.get("algorithm") == "sac" else found))
+    return TrainingConfig.suited(**found)
 
 
 def _folder(config: TrainingConfig, environment: str) -> str:
-    extras = "bounds" * config.bounds, "per_type" * config.per_type
+    shield = "" if config.shield is None else f"shield-{config.shield}"
+    extras = "bounds" * config.bounds, shield, "per_type" * config.per_type
     return folder_name(
         environment, str(config.scenario or ""), config.observe, *extras, f"{config.algorithm}-{config.seed}"
     )
@@ -211,4 +231,7 @@ def _play(config: TrainingConfig, folder: Path) -> str:
             command += [f"--{name}", value]
             continue
         command += ["--env", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
-    return shlex.join([*command, "--policies", f"{config.algorithm}:{folder}"])
+    policy = f"{config.algorithm}:{folder}"
+    if config.shield is not None:
+        policy = shielded_name(policy, str(config.shield))
+    return shlex.join([*command, "--policies", policy])

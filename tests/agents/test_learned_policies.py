@@ -40,6 +40,31 @@ def test_the_last_observation_is_scaled_like_the_others():
     assert infos[row]["terminal_observation"].shape == (scaler.size,)
 
 
+def test_the_nearest_of_the_others_comes_first():
+    """Whatever slot it is in; its features of the step before go with it, and unknown ones come last."""
+    env = batched("navigation_v0", "crossing", num_envs=3)
+    before, _ = env.reset(0)
+    observations, *_ = env.step(np.full((3, 8, 2), 0.5))
+    layout = env.layouts[0]
+    slots = np.array([layout.columns(f"slot{q}") for q in range(len(layout.slots))])
+    nearest, plain = (ObservationScaler.of(describe(env), rates=True, nearest=each) for each in (True, False))
+    features = nearest(observations, before)
+    order = np.random.default_rng(0).permutation(len(slots))
+    shuffled, shuffled_before = observations.copy(), before.copy()
+    shuffled[..., slots.ravel()] = observations[..., slots[order].ravel()]
+    shuffled_before[..., slots.ravel()] = before[..., slots[order].ravel()]
+    np.testing.assert_array_equal(nearest(shuffled, shuffled_before), features)
+    known = features[..., slots[:, 0]] > 0.0  # the first column of a slot says whether it is
+    places = np.array([layout.columns(f"slot{q}.position") for q in range(len(slots))])
+    distance = np.where(known, np.linalg.norm(features[..., places], axis=-1), 1e9)
+    assert (np.diff(distance, axis=-1) >= 0.0).all()
+    assert known.any()
+    assert not known.all()
+    unsorted = plain(observations, before)
+    np.testing.assert_array_equal(np.sort(features, axis=-1), np.sort(unsorted, axis=-1))
+    assert not np.array_equal(features, unsorted)
+
+
 def test_agents_with_a_heading_see_others_in_their_own_frame():
     """Rotated into the own frame of agents with a heading; unchanged for integrators and carts."""
     env = batched("formation_v0", "mixed_fleet", num_envs=3)

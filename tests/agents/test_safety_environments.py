@@ -143,8 +143,8 @@ def test_a_policy_that_leaves_agents_out_is_named():
     policy.reset(describe(env), [0])
     observations = by_agent(env, env.reset(0)[0])
     for actions, message in (
-        ({}, "inside the safety filter has no action for 'integrator_0'"),
-        (dict.fromkeys(env.agents, np.zeros((1, 3))), r"must have shape \(1, 2\).* gave \(1, 3\)"),
+        ({}, "the safety filter got no action for 'integrator_0'"),
+        (dict.fromkeys(env.agents, np.zeros((1, 3))), r"must have shape \(1, 2\).* got \(1, 3\)"),
     ):
         policy.policy.act = lambda observations, actions=actions: actions
         with pytest.raises(ValueError, match=message):

@@ -1,0 +1,55 @@
+"""A training that begins with the networks of another one."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.learning.checkpoint import read_checkpoint, restore_networks
+from agents.learning.learned import LearnedPolicy
+from agents.learning.networks import load_actor
+from agents.learning.policy_file import PolicyFileError
+from agents.learning.run_folder import CHECKPOINT
+from agents.learning.scaling import RATE
+from agents.policy import EnvDescription
+
+
+def begin_from(source: str, model: BaseAlgorithm, new: LearnedPolicy, env: EnvDescription) -> None:
+    """Give a new model the networks of another run.
+
+    Args:
+        source: a run's folder, from whose end policy, value function and exploration are taken; or a policy's file,
+            which has nothing but the policy.
+        model: changed.
+        new: the model's policy, for comparison.
+        env: what it is trained in.
+
+    Raises:
+        ValueError: if there is no such run or file, or its observations, actions or networks are others.
+    """
+    folder = Path(source)
+    whole = folder.is_dir()
+    try:
+        policy = LearnedPolicy.load(folder / "last.npz" if whole else folder)
+        period = RATE / policy.scaler.rate  # may be another one: features are in m and m/s
+        policy.reset(dataclasses.replace(env, shielded=True, control_period=period), [0])
+        if differs := _difference(policy, new):
+            raise PolicyFileError(differs)
+        if not whole:
+            load_actor(model, policy.networks)
+            return
+        restore_networks(model, read_checkpoint(folder / CHECKPOINT)["model"])
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise ValueError(f"can't begin from {source}: {error}") from error
+
+
+def _difference(old: LearnedPolicy, new: LearnedPolicy) -> str:
+    """In what networks or features differ; empty if they don't."""
+    for name in ("algorithm", "per_type", "rates", "nearest", "hidden"):
+        pair = [policy.about.get(name, False) for policy in (old, new)]
+        if pair[0] != pair[1]:
+            return f"it was trained with {name} = {pair[0]!r}, and this run has {name} = {pair[1]!r}"
+    kinds = [" and ".join(sorted(policy.networks)) for policy in (old, new)]
+    return "" if kinds[0] == kinds[1] else f"its networks are for agents of type {kinds[0]}, and here for {kinds[1]}"
