@@ -110,9 +110,8 @@ class SafetyFilter:
 
     def __repr__(self) -> str:
         announced = ", announce=True" if self.announce else ""
-        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{announced})"
         reckoning = ", dead_reckoning=True" if self.dead_reckoning else ""
-        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{reckoning})"
+        return f"SafetyFilter({self.policy!r}, margin={self.margin!r}, gamma={self.gamma:g}{announced}{reckoning})"
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Look up the columns, and reset the policy inside.
@@ -122,7 +121,6 @@ class SafetyFilter:
         """
         self._env = env
         columns = read_columns(env, self.margin, self.radius, self.announce)
-        columns = read_columns(env, self.margin, self.radius)
         self._others = _held(env) if self.dead_reckoning else None
         self._columns: Any = tuple(columns)
         self._speed, self._own, self._scale = columns.speed, columns.own, columns.scale
@@ -222,6 +220,8 @@ class SafetyFilter:
         if self._bounds is not None:
             return self._bounds
         policy = self.policy
+        if getattr(policy, "needs_bounds", False):
+            return True
         if isinstance(policy, PretrainedPolicy):
             policy.environment = policy.environment or env.environment
             return bool(policy.about_for(env.scenario).get("bounds"))

@@ -25,8 +25,8 @@ def tune(
     policies: Annotated[
         str | None,
         typer.Option(
-            help="Laws (tanh, linear, formation, leader_following); in navigation_v0 policies with a margin: "
-            "filter:margin=none, filter:margin=none,dead_reckoning=true, orca. By default all laws, or the first of these."
+            help="Laws (tanh, linear, formation, leader_following); in navigation_v0 what has a margin: "
+            "filter:margin=none, filter:margin=none,dead_reckoning=true, orca. By default all laws, or that filter."
         ),
     ] = None,
     observe: Annotated[
@@ -41,9 +41,9 @@ def tune(
 
     Each line is printed when its search ends; after an interrupt, the last line has the best parameters so far.
 
-    Margins of policies that keep apart: the smallest without a collision in the tuning episodes, or a larger one with a
-    larger return. Where losses are independent and agents few, a tuned margin is faster than the certified filter. It
-    has no guarantee, and no margin of this kind is safe where losses come in bursts: agents collide, or stand still.
+    Margins of policies that keep apart: the smallest without a collision in the tuning episodes, or up to 1 m the one
+    with the fewest. Where losses are independent and agents few, a tuned margin is faster than the certified filter. It
+    has no guarantee, and where losses come in bursts agents collide, or stand still.
     """
     from agents.laws import LAWS
     from agents.tuning import SEEDS, tune, tune_margin

@@ -6,7 +6,7 @@ from scipy.optimize import linprog
 
 from agents import describe, make_policy, play, shielded
 from agents.others import Others, side_by_side
-from agents.policies import needs_bounds
+from agents.policies import needs
 from agents.policy import by_agent
 from khop_env import consensus_v0, make_batched
 
@@ -206,9 +206,10 @@ def test_the_barrier_keeps_apart_few_that_know_well_and_not_many_over_bursts():
 
 
 def test_what_the_barrier_is_not_for_is_refused():
-    assert needs_bounds(make_policy("robust_barrier:alpha=2"))
-    assert needs_bounds(shielded("robust_barrier", 0.1))
-    assert not needs_bounds(make_policy("orca"))
+    assert needs(make_policy("robust_barrier:alpha=2")).bounds
+    assert needs(shielded("robust_barrier", 0.1)).bounds
+    assert not needs(make_policy("orca")).bounds
+    shielded("robust_barrier", 0.1).reset(describe(make_batched("navigation_v0", "crossing", bounds=True)), [0])
     with pytest.raises(ValueError, match=r"alpha must be positive and finite; got -1.0"):
         make_policy("robust_barrier:alpha=-1")
     for scenario, bounds, message in (
