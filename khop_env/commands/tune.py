@@ -43,7 +43,8 @@ def tune(
 
     Margins of policies that keep apart: the smallest without a collision in the tuning episodes, or up to 1 m the one
     with the fewest. Where losses are independent and agents few, a tuned margin is faster than the certified filter. It
-    has no guarantee, and where losses come in bursts agents collide, or stand still.
+    has no guarantee: no collision in 64 episodes shows only that fewer than about 5 % collide, and where losses come in
+    bursts agents collide, or stand still.
     """
     from agents.laws import LAWS
     from agents.tuning import SEEDS, tune, tune_margin
@@ -95,7 +96,10 @@ def tune(
                         pairs = (f"{key} = {json.dumps(value)}" for key, value in best.parameters.items())
                         rates = ""
                         if best.collision_rate is not None and best.success_rate is not None:
-                            rates = f"  # {best.collision_rate:.1%} collided, {best.success_rate:.1%} succeeded"
+                            collided, succeeded = (
+                                round(rate * len(SEEDS)) for rate in (best.collision_rate, best.success_rate)
+                            )
+                            rates = f"  # {collided} of {len(SEEDS)} collided, {succeeded} succeeded"
                         typer.echo(f"{mode} = {{ {', '.join(pairs)} }}{rates}{'  # interrupted' * interrupted}")
                         if interrupted:
                             say("khop: interrupted; above are the parameters that were found until then")
