@@ -103,11 +103,11 @@ def tune(
 def tune_margin(
     env: object, policy: str, seeds: Sequence[int] = SEEDS, *, progress: Callable[[float], None] | None = None
 ) -> Tuned:
-    """The margin of 0, 0.05, ... 1 m with the fewest collisions, and of those the one with the largest return.
+    """The smallest margin of 0, 0.05, ... 1 m without a collision.
 
-    Margins grow until no episode has a collision, and on while the return grows. What is found holds for the tuning
-    episodes: it is no bound, and where ages of messages have none, no constant is. Collisions are few, too, at margins
-    at which nobody moves any more: look at the successes.
+    If there is none, the one with the fewest collisions, and of those the one with the largest return. What is found
+    holds for the tuning episodes: it is no bound, and where ages of messages have none, no constant is. Collisions are
+    few, too, at margins at which nobody moves any more: look at the successes.
 
     Args:
         env: an environment of khop_env in which agents may collide; num_envs episodes run at a time.
@@ -139,13 +139,13 @@ def tune_margin(
     default, interrupted = top[1], False
     try:
         for margin in _MARGINS[1:]:
+            if top[0] == 0.0:
+                break
             found, trials = value(margin), trials + 1
             if progress is not None:
                 progress(trials / len(_MARGINS))
             if (-found[0], found[1]) > (-top[0], top[1]):
                 best, top = margin, found
-            elif top[0] == 0.0:
-                break
     except KeyboardInterrupt:
         interrupted = True
     result = Tuned({"margin": best}, top[1], default, trials, collision_rate=top[0], success_rate=top[2])

@@ -262,6 +262,8 @@ class SafetyFilter:
         if self._bounds is not None:
             return self._bounds
         policy = self.policy
+        if getattr(policy, "needs_bounds", False):
+            return True
         if isinstance(policy, PretrainedPolicy):
             policy.environment = policy.environment or env.environment
             return bool(policy.about_for(env.scenario).get("bounds"))

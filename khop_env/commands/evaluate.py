@@ -37,7 +37,7 @@ def evaluate(
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
-            "go_to_goal and keep_right in navigation_v0; classes of your own, my_file.py:MyPolicy; any of them in a "
+            "go_to_goal, keep_right, orca and robust_barrier in navigation_v0; classes of your own, my_file.py:MyPolicy; any of them in a "
             "safety filter, filter:tanh. By default tanh, linear, zero and random, or go_to_goal, zero and "
             "random."
         ),

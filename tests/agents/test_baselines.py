@@ -209,6 +209,7 @@ def test_what_the_barrier_is_not_for_is_refused():
     assert needs(make_policy("robust_barrier:alpha=2")).bounds
     assert needs(shielded("robust_barrier", 0.1)).bounds
     assert not needs(make_policy("orca")).bounds
+    shielded("robust_barrier", 0.1).reset(describe(make_batched("navigation_v0", "crossing", bounds=True)), [0])
     with pytest.raises(ValueError, match=r"alpha must be positive and finite; got -1.0"):
         make_policy("robust_barrier:alpha=-1")
     for scenario, bounds, message in (
