@@ -37,9 +37,9 @@ def evaluate(
         typer.Option(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
-            "go_to_goal, keep_right, orca and robust_barrier in navigation_v0; classes of your own, my_file.py:MyPolicy; any of them in a "
-            "safety filter, filter:tanh. By default tanh, linear, zero and random, or go_to_goal, zero and "
-            "random."
+            "go_to_goal, keep_right, orca and robust_barrier in navigation_v0; classes of your own, "
+            "my_file.py:MyPolicy; any of them in a safety filter, filter:tanh. By default tanh, linear, zero and "
+            "random, or go_to_goal, zero and random."
         ),
     ] = None,
     observe: Annotated[
