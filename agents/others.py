@@ -52,7 +52,7 @@ class Others:
                 valid.append(start + layout.index(f"{name}.valid"))
                 late = (
                     f"{name}.age" in layout.names and env.observe != "oracle"
-                )  # on the truth ages are of messages only
+                )  # where ages are those of messages only
                 age.append(start + layout.index(f"{name}.age") if late else -1)
                 held.append(model is not None and model.type in HELD and age[-1] >= 0)
                 limit.append(np.zeros(2) if model is None else fastest(model))

@@ -17,7 +17,7 @@ from agents.half_planes import BOX, best_velocity, box_limits
 from agents.navigation import KeepRight, towards
 from agents.orca import bodies_of, obstacle_limits
 from agents.others import Others, fastest
-from agents.policy import EnvDescription
+from agents.policy import EnvDescription, Observations
 from agents.velocity_law import VELOCITY_INPUTS
 from khop_env.compiled import compiled
 from khop_env.env.layout import Float32Array
@@ -45,7 +45,9 @@ class RobustBarrier(KeepRight):
 
     Attributes:
         needs_bounds: True: it reads certified bounds.
-        infeasible: by agent (B,), whether the last program had no solution.
+        correction: by agent (..., 2), chosen input less that of `keep_right`, in m/s, of the last `act`.
+        intervention: by agent (...), its length.
+        infeasible: by agent (...), whether the program had no solution.
 
     Raises:
         ValueError: for an argument out of range.
@@ -57,6 +59,8 @@ class RobustBarrier(KeepRight):
         if not 0.0 < alpha < math.inf:
             raise ValueError(f"alpha must be positive and finite; got {alpha!r}")
         self.alpha = float(alpha)
+        self.correction: dict[str, FloatArray] = {}
+        self.intervention: dict[str, FloatArray] = {}
         self.infeasible: dict[str, NDArray[np.bool_]] = {}
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
@@ -91,13 +95,23 @@ class RobustBarrier(KeepRight):
         self._bounds, self._fast, self._valid = np.array(bounds), np.array(fast), np.array(valid)
         self._pushed = np.array([env.disturbance[agent] for agent in env.agents], float)
 
+    def act(self, observations: Observations) -> dict[str, Float32Array]:
+        """Inputs as fractions of their limits."""
+        actions = super().act(observations)
+        for i, (agent, action) in enumerate(actions.items()):
+            shape = action.shape[:-1]
+            self.correction[agent] = self._change[:, i].reshape(*shape, 2)
+            self.intervention[agent] = np.linalg.norm(self.correction[agent], axis=-1)
+            self.infeasible[agent] = self._infeasible[:, i].reshape(shape)
+        return actions
+
     def inputs(self, flat: Float32Array, states: FloatArray, ways: dict[str, FloatArray]) -> dict[str, FloatArray]:
         """See the class."""
         pairs, time = self._pairs, np.zeros(len(flat))
         wish = np.stack([towards(model, states[:, s], ways[agent]) for agent, model, s in self._agents()], axis=1)
         drift = np.stack([model.drift(time, states[:, s]) for _, model, s in self._agents()], axis=1)
         limit = np.stack([model.input_limit for _, model, _ in self._agents()])
-        chosen, infeasible = np.empty_like(wish), np.empty(wish.shape[:2], np.bool_)
+        chosen, self._infeasible = np.empty_like(wish), np.empty(wish.shape[:2], np.bool_)
         _choose(
             pairs.first,
             pairs.position,
@@ -112,10 +126,10 @@ class RobustBarrier(KeepRight):
             drift + limit,
             self.alpha,
             chosen,
-            infeasible,
+            self._infeasible,
         )
-        self.infeasible = {agent: infeasible[:, i] for i, agent in enumerate(ways)}
         u = np.clip(chosen - drift, -limit, limit)
+        self._change = u - wish
         return {agent: u[:, i] for i, agent in enumerate(ways)}
 
 

@@ -214,12 +214,15 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
         )
     header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)")
     print_table((*header, *["infeasible %"] * began_anew, "return", "e / bound"), rows, title, whole=header[1:4])
-    infeasible = "infeasible: share of agents and time in which a filter's guarantee had to be begun anew; "
+    infeasible = (
+        "infeasible: share of agents and time in which a filter's guarantee had to be begun anew, or a barrier had no "
+        "solution; "
+    )
     print_text(
         "collided: episodes with a collision; success: all at their goals at the end, without any collision; deadlock: "
         "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals. "
         "time: until an agent's first arrival, mean over agents and successful episodes; distance: smallest of two "
-        "agents' centres; changed: by a filter, of each agent's inputs, mean over time; "
+        "agents' centres; changed: by a filter or barrier, of each agent's inputs, mean over time; "
         f"{infeasible if began_anew else ''}return: mean over agents of an episode's sum, 95 % interval; e / bound: "
         "largest estimation error over its bound (below 1 by guarantee)"
     )

@@ -8,7 +8,7 @@ from agents import describe, make_policy, play, shielded
 from agents.others import Others, side_by_side
 from agents.policies import needs
 from agents.policy import by_agent
-from khop_env import consensus_v0, make_batched
+from khop_env import consensus_v0, make_batched, navigation_v0
 
 BURSTS = "crossing:disturbance=0,loss=0.3,burst=5"
 
@@ -104,6 +104,7 @@ def test_dead_reckoning_is_refused_where_it_has_nothing_to_do_or_no_meaning():
         make_policy("filter:dead_reckoning=true")
     policy = shielded("keep_right", 0.1, dead_reckoning=True)
     assert "dead_reckoning=True" in repr(policy)
+    assert not make_policy("filter:margin=0.1").dead_reckoning
     policy.reset(describe(make_batched("navigation_v0", "crossing", observe="oracle")), [0])  # it changes nothing there
     for scenario in ("crossing:continuous=true", "crossing:model=drifter"):
         with pytest.raises(
@@ -200,9 +201,12 @@ def test_the_barrier_keeps_apart_few_that_know_well_and_not_many_over_bursts():
     env = make_batched("navigation_v0", "crossing:agents=4,loss=0,burst=1", num_envs=32, bounds=True)
     outcomes = play(env, make_policy("robust_barrier"), range(32)).outcomes
     assert not outcomes["collision"].any()
+    assert (outcomes["intervention"] > 0.0).all()
     assert outcomes["success"].mean() > 0.9
     env = make_batched("navigation_v0", "swap:loss=0.3,burst=5", num_envs=32, bounds=True)
-    assert play(env, make_policy("robust_barrier"), range(32)).outcomes["collision"].mean() > 0.1
+    outcomes = play(env, make_policy("robust_barrier"), range(32)).outcomes
+    assert outcomes["collision"].mean() > 0.1
+    assert outcomes["infeasible"].mean() > 0.1
 
 
 def test_what_the_barrier_is_not_for_is_refused():
@@ -221,3 +225,15 @@ def test_what_the_barrier_is_not_for_is_refused():
             make_policy("robust_barrier").reset(describe(env), [0])
     with pytest.raises(ValueError, match="go_to_goal needs an environment with goals"):
         make_policy("robust_barrier").reset(describe(consensus_v0.parallel_env(bounds=True)), [0])
+
+
+def test_a_single_environment_has_values_without_a_batch():
+    """As frames and films read them."""
+    env = navigation_v0.parallel_env(bounds=True)
+    policy = make_policy("robust_barrier")
+    policy.reset(describe(env), [0])
+    observations, _ = env.reset(seed=0)
+    actions = policy.act(observations)
+    for agent in env.agents:
+        shapes = (each[agent].shape for each in (actions, policy.correction, policy.intervention, policy.infeasible))
+        assert tuple(shapes) == ((2,), (2,), (), ())
