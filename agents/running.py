@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
+from agents.outcomes import Outcomes
 from agents.policies import make_policy, needs
 from agents.policy import Policy, describe, policy_seeds
 from agents.safety import SafetyFilter
 from khop_env.env import KHopEnv, Settings
 from khop_env.objects import described
-from khop_env.observers import Extremes, FunnelError, SolveError
+from khop_env.observers import Extremes, FloatArray, FunnelError, SolveError
 from khop_env.registry import Environment, environments, find_task, make
 from khop_env.results.recording import Drawing, StoppedError
 from khop_env.scenarios import Scenario
@@ -51,6 +52,7 @@ class PolicyRun:
         self._observations, _ = env.reset(seed=seed)
         self._extremes = self.simulator.extremes
         self.episode_return = 0.0
+        self._cycle, self._outcomes = 0, Outcomes(env.batched, self._infos())
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.simulator, name)
@@ -69,6 +71,11 @@ class PolicyRun:
     def task_error(self) -> float:
         """Current task error, mean over the agents."""
         return float(self.env.batched.task_errors().mean())
+
+    @property
+    def outcomes(self) -> dict[str, float]:
+        """Of an environment in which agents may collide, as in `Episodes.outcomes`; nan where there is none."""
+        return {name: float(values[0]) for name, values in self._outcomes.result().items()}
 
     def drawing(self) -> Drawing:
         """What the task adds to a frame of the present state, also after later steps."""
@@ -93,8 +100,15 @@ class PolicyRun:
             self.env.batched.world.marked = np.stack(list(infeasible.values()))[:, None]
         self._observations, rewards, *_ = self._guarded(self.env.step, actions)
         self.episode_return += float(np.mean(list(rewards.values())))
+        self._cycle += 1
+        over = np.array([self.ended()])
+        self._outcomes.add(self._cycle, np.ones(1, np.bool_), over, self._infos(), self.policy)
         for running, now in zip(self._extremes, self.simulator.extremes, strict=True):
             np.maximum(running, now, out=running)
+
+    def _infos(self) -> Mapping[str, FloatArray]:
+        """(1, N) each, at present."""
+        return self.env.batched.task.evaluate(self.env.batched.world).infos
 
     def _guarded(self, function: Any, *arguments: Any) -> Any:
         """What a function returns; its exceptions don't lose what was recorded before."""

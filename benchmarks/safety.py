@@ -244,10 +244,11 @@ def print_counts(counts: Sequence[Count]) -> None:
     header = ("with certified bounds", "episodes", "collided", "distance", "infeasible", "on point estimates")
     print_table(header, rows, "Episodes with a collision, by filter, condition, scenario, and policy inside")
     for name, found in totals(counts).items():
+        limit = f", a rate below {found['upper_limit_95']:.2g} with 95 % confidence" if name == "certified" else ""
         print_text(
-            f"{TOTALS[name]}: {found['collisions']} of {found['episodes']} episodes with a collision, a rate below "
-            f"{found['upper_limit_95']:.2g} with 95 % confidence; smallest distance {found['min_distance']:.4f} m, "
-            f"bodies touch at 0.4 m; {found['infeasible']} episodes in which a guarantee had to be begun anew"
+            f"{TOTALS[name]}: {found['collisions']} of {found['episodes']} episodes with a collision{limit}; smallest "
+            f"distance {found['min_distance']:.4f} m, bodies touch at 0.4 m; {found['infeasible']} episodes in which a "
+            "guarantee had to be begun anew"
         )
 
 

@@ -6,7 +6,7 @@ python -m benchmarks.safety_table crossing swap:agents=16,duration=30 --episodes
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -114,8 +114,8 @@ def cells(method: Method, scenario: str, seeds: Sequence[int], workers: int) -> 
     return found
 
 
-def table(scenario: str, seeds: Sequence[int], workers: int = 1, methods: Sequence[Method] = METHODS) -> list[str]:
-    """Lines of Markdown; methods that aren't there are left out, with a message, and so are those after an interrupt.
+def table(scenario: str, seeds: Sequence[int], workers: int = 1, methods: Sequence[Method] = METHODS) -> Iterator[str]:
+    """Lines of Markdown, as they are measured; methods that aren't there are left out, with a message.
 
     Args:
         scenario: of navigation_v0.
@@ -123,15 +123,14 @@ def table(scenario: str, seeds: Sequence[int], workers: int = 1, methods: Sequen
         workers: number of processes.
         methods: the rows.
     """
-    lines = [f"**`{scenario}`**", "", f"| | {' | '.join(NETWORKS)} |", "|---" * (1 + len(NETWORKS)) + "|"]
+    yield from (f"**`{scenario}`**", "", f"| | {' | '.join(NETWORKS)} |", "|---" * (1 + len(NETWORKS)) + "|")
     with Progress(scenario) as progress:
         for number, method in enumerate(methods):
             try:
-                lines.append(f"| {method.label} | {' | '.join(cells(method, scenario, seeds, workers))} |")
+                yield f"| {method.label} | {' | '.join(cells(method, scenario, seeds, workers))} |"
             except (ValueError, UnfinishedError) as error:
                 progress.say(f"left out: {method.label}: {error}")
             progress((number + 1) / len(methods))
-    return lines
 
 
 def main() -> None:
@@ -151,7 +150,9 @@ def main() -> None:
     )
     try:
         for scenario in chosen.scenarios:
-            print("\n".join(table(scenario, range(chosen.episodes), chosen.workers)), end="\n\n", flush=True)
+            for line in table(scenario, range(chosen.episodes), chosen.workers):
+                print(line, flush=True)
+            print()
     except (KeyboardInterrupt, Interrupted):
         say("interrupted")
         raise SystemExit(130) from None

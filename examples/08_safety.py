@@ -1,6 +1,6 @@
 """Keeping apart from agents that nobody hears: the same filter on point estimates, and on estimates with bounds.
 
-Messages are lost in bursts, so that what agents know of each other may be old. The theorem is in docs/theory_safety.md.
+Messages are lost in bursts, so that what agents know of each other may be old. docs/safety.md says what is certain.
 """
 
 from agents import compare

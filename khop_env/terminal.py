@@ -223,6 +223,8 @@ def _print_end(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None:
             f"{summary['environment']}: return {_number(summary['return'])}, task error at the end {error} (both means "
             "over the agents)"
         )
+        if "outcomes" in summary:
+            _print_outcomes(summary["outcomes"])
     else:
         error = _number(summary["final_consensus_error"], summary["position_unit"])
         print_text(f"consensus error at the end: {error} (|Pi p|: distance of all positions together from their mean)")
@@ -234,6 +236,20 @@ def _print_end(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None:
     for name in ("estimates", "states", "summary", "figure", "video"):
         if name in files:
             typer.echo(f"{name}: {files[name]}")
+
+
+def _print_outcomes(found: Mapping[str, float | None]) -> None:
+    """Of an episode in which agents may collide."""
+    text = (
+        f"{'a collision' if found['collision'] else 'no collision'}, smallest distance {found['min_distance']:.4g} m; "
+    )
+    arrived = found["arrival_time"]
+    text += "not all at their goals" if arrived is None else f"all at their goals, after {arrived:.3g} s in the mean"
+    if found["intervention"] is not None:
+        text += f"; inputs changed by {found['intervention']:.3g} m/s in the mean"
+    if found["infeasible"]:
+        text += f", a guarantee begun anew in {100.0 * found['infeasible']:.2g} % of agents and time"
+    print_text(text)
 
 
 def _number(value: float | None, unit: str = "") -> str:

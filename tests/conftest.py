@@ -78,7 +78,7 @@ SLOW = tuple(
         "agents/test_set_iss.py",
         "agents/test_tuning.py",
         "benchmarks/test_benchmark.py::test_every_promised_figure_is_printed",
-        "benchmarks/test_safety.py",
+        "benchmarks/test_counting_collisions.py",
         "benchmarks/test_violations.py",
         "env/test_changing_links.py::test_the_public_checks_pass",
         "env/test_contract.py::test_the_public_checks_pass",

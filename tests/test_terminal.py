@@ -73,3 +73,16 @@ def test_tables_fold_columns_and_never_words(data, width):
     ]
     longest = max(len(line.rstrip()) for line in found.splitlines())
     assert longest <= max(width, sum(least) + 2 * (count - 1))
+
+
+def test_outcomes_of_an_episode_in_words(capsys):
+    found = {"collision": 1.0, "arrival_time": None, "min_distance": 0.2, "intervention": None, "infeasible": None}
+    terminal._print_outcomes(found)
+    terminal._print_outcomes(
+        found | {"collision": 0.0, "arrival_time": 3.21, "intervention": 0.125, "infeasible": 0.01}
+    )
+    assert " ".join(capsys.readouterr().out.split()) == (
+        "a collision, smallest distance 0.2 m; not all at their goals no collision, smallest distance 0.2 m; all at "
+        "their goals, after 3.21 s in the mean; inputs changed by 0.125 m/s in the mean, a guarantee begun anew in 1 % "
+        "of agents and time"
+    )

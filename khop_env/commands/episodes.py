@@ -207,7 +207,7 @@ def result_of(played: PolicyRun, recording: Recording) -> dict[str, Any]:
     """What an environment adds to a run's summary."""
     from khop_env.results.metrics import finite
 
-    batched = played.env.batched
+    batched, outcomes = played.env.batched, played.outcomes
     assert recording.task_error is not None
     return {
         "environment": batched.task.environment,
@@ -215,6 +215,7 @@ def result_of(played: PolicyRun, recording: Recording) -> dict[str, Any]:
         "final_task_error": finite(float(recording.task_error[-1])),
         "task_error_unit": batched.task.error_unit(batched.world),
         "terminated": bool(recording.time[-1] < played.duration - 1e-9) and recording.completed,
+        **({"outcomes": {name: finite(value) for name, value in outcomes.items()}} if outcomes else {}),
     }
 
 

@@ -11,8 +11,10 @@ from typer.testing import CliRunner
 from agents import compare, describe, make_policy, play
 from agents.outcomes import wilson95
 from agents.policy import policy_seeds
+from agents.running import policy_run
 from khop_env import make_batched, navigation_v0
 from khop_env.cli import app
+from khop_env.registry import scenario
 
 
 class Slowed:
@@ -139,3 +141,18 @@ def test_the_command_prints_rates_and_networks():
     unsure = khop("--policies", f"zero,{__file__}:Slowed", "--env", "max_cycles=20").stdout
     assert "infeasible: share of agents and time" in " ".join(unsure.split())
     assert unsure.count("infeasible") == 2  # in the header, too
+
+
+def test_a_run_has_the_outcomes_of_an_evaluation():
+    """Of the same episode, to the end."""
+    chosen = scenario("swap:agents=4")
+    env = make_batched("navigation_v0", chosen)
+    for spec in ("filter:margin=none", "go_to_goal"):
+        expected = play(env, make_policy(spec), [3]).outcomes
+        run = policy_run(spec, chosen, "estimate", None, 3, environment="navigation_v0")
+        while not run.ended():
+            run.step(0.05)
+        assert set(run.outcomes) == set(expected)
+        for name, value in run.outcomes.items():
+            np.testing.assert_array_equal(value, expected[name], name)
+    assert policy_run("zero", scenario("paper"), "estimate", 0.1, 0).outcomes == {}

@@ -5,7 +5,7 @@ import json
 import pytest
 from PIL import Image
 
-from benchmarks import safety, safety_film
+from benchmarks import safety, safety_film, safety_table
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +72,18 @@ def test_a_film_of_both(tmp_path, monkeypatch):
         assert film.size == (1036, 480)
         assert film.n_frames >= 25
     assert dict(counts) == {"filter on point estimates": 2, "filter on certified bounds": 0}
+
+
+def test_a_table_of_methods():
+    """Cells are rates in % and a time; a policy that isn't there is left out, not the table."""
+    methods = [
+        safety_table.Method("nobody moves", "zero"),
+        safety_table.Method("unknown", "nothing"),
+        safety_table.Method("all wait", safety_table.WORST),
+    ]
+    lines = list(safety_table.table("crossing:agents=4,duration=2", range(3), methods=methods))
+    assert lines[0] == "**`crossing:agents=4,duration=2`**"
+    assert lines[4] == "| nobody moves | 0 / 0 / - | 0 / 0 / - | 0 / 0 / - | 0 / 0 / - |"
+    assert [line.split(" | ")[0] for line in lines[4:]] == ["| nobody moves", "| all wait"]
+    assert safety_table.oldest("crossing:agents=4", "ideal", 5) < 0.2
+    assert safety_table.oldest("crossing:agents=4", "ideal:loss=0.3,burst=5", 5) > 0.4
