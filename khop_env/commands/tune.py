@@ -42,9 +42,9 @@ def tune(
     Each line is printed when its search ends; after an interrupt, the last line has the best parameters so far.
 
     Margins of policies that keep apart: the smallest without a collision in the tuning episodes, or up to 1 m the one
-    with the fewest. Where losses are independent and agents few, a tuned margin can be faster than the certified filter. It
-    has no guarantee: no collision in 64 episodes shows only that fewer than about 5 % collide, and where losses come in
-    bursts agents collide, or stand still.
+    with the fewest. Where losses are independent and agents few, a tuned margin can be faster than the certified
+    filter. It has no guarantee: no collision in 64 episodes shows only that fewer than about 5 % collide, and where
+    losses come in bursts agents collide, or stand still.
     """
     from agents.laws import LAWS
     from agents.tuning import SEEDS, tune, tune_margin
