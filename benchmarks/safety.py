@@ -6,6 +6,7 @@ python -m benchmarks.safety --episodes 10000         # eight minutes on a core
 from __future__ import annotations
 
 import argparse
+import math
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -188,11 +189,18 @@ def upper_limit(collided: int, episodes: int) -> float:
         collided: episodes with a collision.
         episodes: of how many.
     """
-    if collided == 0:
-        return float(1.0 - 0.05 ** (1.0 / episodes))
-    from scipy.stats import beta
-
-    return 1.0 if collided == episodes else float(beta.ppf(0.95, collided + 1, episodes - collided))
+    if collided == episodes:
+        return 1.0
+    low, high = collided / episodes, 1.0
+    while high - low > 1e-9:  # so few collisions are as improbable as that at a larger rate
+        rate = (low + high) / 2.0
+        terms = (
+            math.lgamma(episodes + 1) - math.lgamma(k + 1) - math.lgamma(episodes - k + 1)
+            + k * math.log(rate) + (episodes - k) * math.log1p(-rate)
+            for k in range(collided + 1)
+        )  # fmt: skip
+        low, high = (rate, high) if sum(map(math.exp, terms)) > 0.05 else (low, rate)
+    return high
 
 
 def summary(counts: Sequence[Count]) -> dict[str, int | float]:
