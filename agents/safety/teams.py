@@ -58,7 +58,7 @@ class _Agent:
 
     def __init__(self, agent: str = "", env: EnvDescription | None = None, margin: Margin = "none") -> None:
         self.kind, self.limit, self.turning, self.fastest, self.pull = INTEGRATOR, np.zeros(3), 0.0, math.inf, 0.0
-        self.rounding, self.speedrounding_of, self.within = np.zeros(2), np.zeros(2), np.zeros(2)
+        self.rounding, self.speed_rounding, self.within = np.zeros(2), np.zeros(2), np.zeros(2)
         self.error, self.speed_error, self.jump = np.zeros(2), np.zeros(2), np.zeros(2)
         self.axes, self.ship = [np.zeros(NUMBERS)] * 2, np.zeros(SHIP_NUMBERS)
         if env is None:
