@@ -10,13 +10,13 @@ import math
 from agents.safety.moves import EPSILON, ROUNDED, SLACK
 from agents.safety.rows import obstacle_rows
 from agents.safety.stopping import FORWARD, GAIN, KEEP, PUSH, separating_rows, stopping_distance
-from agents.safety.tables import INTEGRATOR, LEFT_OUT, SHIP, UNICYCLE, Team
-from khop_env.compiled import compiled
+from agents.safety.tables import CART, INTEGRATOR, LEFT_OUT, SHIP, UNICYCLE, Team
+from khop_env.compiled import compiled, inlined
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray, IntArray
 
 
-@compiled
+@inlined
 def rows_around(
     team: Team,
     i: int,
@@ -86,7 +86,7 @@ def rows_around(
     return used
 
 
-@compiled
+@inlined
 def others_box(
     columns: IntArray,
     limits: FloatArray,
@@ -110,7 +110,7 @@ def others_box(
         pair: this agent and the other.
         seen: (D,) observations.
         x: (7,) this agent's state.
-        state: (2, 7) overwritten: the other's state and its bounds.
+        state: (2, 7) overwritten: what counts of the other's state, and its bounds.
         certified: whether what is known of its anchor from before is kept.
         memory: (8,) that.
         box: (4,) written: lower and upper x, lower and upper y.
@@ -120,7 +120,7 @@ def others_box(
     """
     s, h = state[0], state[1]
     j, kind, known = columns[pair, 15], columns[pair, 16], True
-    for c in range(7):
+    for c in range(2 if kind in (INTEGRATOR, UNICYCLE) else (4 if kind == CART else 6)):
         s[c] = h[c] = 0.0
         if columns[pair, c] >= 0:
             s[c] = float(seen[columns[pair, c]])
