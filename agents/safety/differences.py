@@ -11,7 +11,7 @@ from agents.safety.moves import EPSILON, ROUNDED, SLACK
 from agents.safety.rows import obstacle_rows
 from agents.safety.stopping import FORWARD, GAIN, KEEP, PUSH, separating_rows, stopping_distance
 from agents.safety.tables import CART, INTEGRATOR, LEFT_OUT, SHIP, UNICYCLE, Team
-from khop_env.compiled import compiled, inlined
+from khop_env.compiled import inlined
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray, IntArray
 

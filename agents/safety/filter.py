@@ -61,7 +61,7 @@ class SafetyFilter:
             filter that only corrects actions that it is given.
         margin: a `Margin`.
         gamma: share of the gap that two agents may use up in a period together, above 0 and at most 1.
-        announce: whether integrators send their anchors in messages, so that neither disturbances nor noise widen the boxes.
+        announce: whether integrators send their anchors in messages, so that disturbances and noise don't widen boxes.
             Anchors then keep to the speed limit, so that an action may be changed where nothing is near, too.
         radius: of an agent's body in m; None for the column `radius` of observations.
         bounds: whether the policy inside observes bounds; None for what a learned policy was trained with, and no
