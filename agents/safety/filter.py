@@ -204,7 +204,7 @@ class SafetyFilter:
             filter_moves(self._columns, flat, wanted, drift, period, self.gamma, *memory, self._resting, *found)
             correction = chosen - wanted
         change = np.linalg.norm(correction, axis=2)
-        changed = (chosen != wanted).any(axis=2)[..., None]
+        changed = (np.linalg.norm(chosen - wanted, axis=2) > 0.0)[..., None]  # what isn't finite is refused later
         safe = np.where(changed, chosen / np.where(limit > 0.0, limit, 1.0), fractions).astype(np.float32)
         corrected = {}
         for number, agent in enumerate(agents):
