@@ -111,7 +111,9 @@ class KeepRight(GoToGoal):
         """
         super().reset(env, seeds)
         require_plane("keep_right", env)
-        self._fast = {agent for agent, model in env.models.items() if model.type in (*VELOCITY_INPUTS, "unicycle")}
+        self._velocity_agents = {
+            agent for agent, model in env.models.items() if model.type in (*VELOCITY_INPUTS, "unicycle")
+        }
         self._others, self._known = {}, {}
         for agent, layout in env.layouts.items():
             slots = range(len(layout.slots))
@@ -140,7 +142,7 @@ class KeepRight(GoToGoal):
         past.append(position.copy())
         if len(past) > self._second:
             moved = np.hypot(*(position - past.pop(0)).T)
-            near = STUCK if agent in self._fast else SLOW_NEAR
+            near = STUCK if agent in self._velocity_agents else SLOW_NEAR
             for env in np.flatnonzero((moved < STUCK) & (distance > near) & (left <= -1.0)).tolist():
                 angle = self._generators[env].uniform(0.0, 2.0 * math.pi)
                 detour[env] = math.cos(angle), math.sin(angle)

@@ -96,6 +96,7 @@ def others_box(
     seen: Float32Array,
     x: FloatArray,
     state: FloatArray,
+    known: bool,
     certified: bool,
     memory: FloatArray,
     box: FloatArray,
@@ -111,6 +112,7 @@ def others_box(
         seen: (D,) observations.
         x: (7,) this agent's state.
         state: (2, 7) overwritten: what counts of the other's state, and its bounds.
+        known: whether this agent knows anything of the other.
         certified: whether what is known of its anchor from before is kept.
         memory: (8,) that.
         box: (4,) written: lower and upper x, lower and upper y.
@@ -119,7 +121,7 @@ def others_box(
         Whether all of it is known.
     """
     s, h = state[0], state[1]
-    j, kind, known = columns[pair, 15], columns[pair, 16], True
+    j, kind = columns[pair, 15], columns[pair, 16]
     for c in range(2 if kind in (INTEGRATOR, UNICYCLE) else (4 if kind == CART else 6)):
         s[c] = h[c] = 0.0
         if columns[pair, c] >= 0:

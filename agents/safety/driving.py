@@ -123,47 +123,32 @@ def drive(
             own[2], own[3] = velocity_x - place[2], velocity_y - place[3]
             for pair in range(team.first[i], team.first[i + 1]):
                 k, valid = pair - team.first[i], team.pair[pair, 14]
-                known[k] = valid < 0 or seen[valid] > 0.5
-                if not known[k] and not team.unknown_stops:
-                    known[k] = LEFT_OUT
-                elif not others_box(
-                    team.pair,
-                    team.pair_limit,
-                    team.widen,
-                    team.axes,
-                    pair,
-                    seen,
-                    x,
-                    state,
-                    team.unknown_stops,
-                    memory[b, pair],
-                    boxes[k],
-                ):
-                    known[k] = 0
-            input_ = chosen[b, i]
+                valid_now = valid < 0 or seen[valid] > 0.5
+                known[k] = LEFT_OUT
+                if valid_now or team.unknown_stops:
+                    known[k] = others_box(
+                        team.pair,
+                        team.pair_limit,
+                        team.widen,
+                        team.axes,
+                        pair,
+                        seen,
+                        x,
+                        state,
+                        valid_now,
+                        team.unknown_stops,
+                        memory[b, pair],
+                        boxes[k],
+                    )
+            want, u = wanted[b, i], chosen[b, i]
             if kind == UNICYCLE:
-                _unicycle(team, i, seen, x, wanted[b, i], period, gamma, inside, rows, box, boxes, known, input_)
+                _unicycle(team, i, seen, x, want, period, gamma, inside, rows, box, boxes, known, u)
             elif kind == INTEGRATOR:
-                _integrator(
-                    team,
-                    i,
-                    seen,
-                    own,
-                    place,
-                    wanted[b, i],
-                    drift[b, i],
-                    period,
-                    gamma,
-                    inside,
-                    rows,
-                    box,
-                    boxes,
-                    known,
-                    input_,
-                )
+                to = drift[b, i]
+                _integrator(team, i, seen, own, place, want, to, period, gamma, inside, rows, box, boxes, known, u)
             else:
-                _braking(team, i, seen, x, own, place, wanted[b, i], gamma, inside, rows, box, boxes, known, input_)
-            dx, dy = input_[0] - wanted[b, i, 0], input_[1] - wanted[b, i, 1]
+                _braking(team, i, seen, x, own, place, want, gamma, inside, rows, box, boxes, known, u)
+            dx, dy = u[0] - want[0], u[1] - want[1]
             if kind == UNICYCLE:
                 dx, dy = dx * x[2], dx * x[3]
             elif kind == SHIP:

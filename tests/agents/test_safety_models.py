@@ -20,6 +20,7 @@ from agents.safety.stopping import (
     separating_rows,
     stopping_distance,
 )
+from khop_env.env.layout import ObservationLayout
 from khop_env.physics import DriftingIntegrator, SingleIntegrator, SurfaceVessel, Unicycle
 from tests.agents.ramming_models import Ram, RammingTeam, cart, ship
 
@@ -296,3 +297,36 @@ def test_every_model_of_the_scenarios(model):
         arguments={"max_cycles": 40},
     )
     assert [row.policy for row in compared.rows] == ["filter"]
+
+
+def test_what_is_remembered_of_others_survives_a_gap_and_is_dropped_with_the_episode():
+    """A slot that isn't valid leaves what follows from before, and stops an agent; new episodes know nothing."""
+    world = RammingTeam(TEAMS["ships"], batch=2, largest=0.0, ring=20.0)
+    env = world.description()
+    layouts = {}
+    for agent, layout in env.layouts.items():  # as without messages: then a flag says whether something is known
+        fields = [field for field in layout.fields if not field.name.endswith(".age")]
+        layouts[agent] = ObservationLayout(agent, fields, layout.slots)
+    env = dataclasses.replace(env, layouts=layouts)
+    policy = SafetyFilter(Ram(world))
+    policy.reset(env, [0, 1])
+    world.move(policy.act(world.observations(env)))
+    first = policy.get_state()["memory"]
+    assert np.isfinite(first).all()
+    agent, blind = env.agents[0], world.observations(env)
+    for name in ("slot0.valid", "slot0.position.x", "slot0.surge"):
+        blind[agent][:, layouts[agent].index(name)] = 0.0
+    actions = policy.act(blind)
+    assert (policy.intervention[agent] > 0.1).all()
+    memory = policy.get_state()["memory"]
+    assert (memory[:, 0, 1::2] >= first[:, 0, 1::2]).all()  # upper ends
+    assert (memory[:, 0, ::2] <= first[:, 0, ::2]).all()
+    np.testing.assert_allclose(memory[:, 0], first[:, 0], atol=0.1)
+    world.move(actions)
+    blind = world.observations(env)
+    policy.begin(2, np.array([1]))
+    blind[agent][1, layouts[agent].index("slot0.valid")] = 0.0
+    policy.act(blind)
+    memory = policy.get_state()["memory"]
+    assert np.isfinite(memory[0, 0]).all()
+    assert np.isnan(memory[1, 0]).all()
