@@ -6,8 +6,8 @@ python -m benchmarks.safety --episodes 10000         # eight minutes on a core
 from __future__ import annotations
 
 import argparse
-import math
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -192,7 +192,7 @@ def upper_limit(collided: int, episodes: int) -> float:
     if collided == episodes:
         return 1.0
     low, high = collided / episodes, 1.0
-    while high - low > 1e-9:  # so few collisions are as improbable as that at a larger rate
+    while high - low > 1e-13:  # so few collisions are as improbable as that at a larger rate
         rate = (low + high) / 2.0
         terms = (
             math.lgamma(episodes + 1) - math.lgamma(k + 1) - math.lgamma(episodes - k + 1)
