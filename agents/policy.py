@@ -35,6 +35,7 @@ class EnvDescription:
         disturbance: bound on |w| of each acting agent by id, (n,) in state units per second.
         message_size: entries at the end of each agent's action that are sent with its messages.
         shielded: whether a safety filter corrects the actions.
+        steps: Euler steps of the simulator in a control period; 0 if it integrates otherwise.
     """
 
     environment: str
@@ -48,6 +49,7 @@ class EnvDescription:
     disturbance: Mapping[str, FloatArray] = field(default_factory=dict)
     message_size: int = 0
     shielded: bool = False
+    steps: int = 1
 
     __repr__ = brief
 
@@ -102,7 +104,15 @@ def describe(env: object) -> EnvDescription:
         error_unit=batched.task.error_unit(batched.world),
         disturbance={agent: pushed[fleet.state_slice(fleet.agent(agent))] for agent in batched.agents},
         message_size=batched.settings.message_size,
+        steps=_euler_steps(batched),
     )
+
+
+def _euler_steps(batched: BatchedEnv) -> int:
+    settings, simulator = batched.settings, batched.simulator
+    if settings.order != 1 and not simulator.observers.by_messages:
+        return 0
+    return settings.substeps * simulator.parts_of(settings.control_period / settings.substeps)
 
 
 def policy_seeds(seeds: Sequence[int]) -> list[int]:

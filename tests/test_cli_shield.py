@@ -82,7 +82,7 @@ def test_every_policy_of_an_evaluation_is_shielded(folder):
             ("run", "rows_of_bodies.py:row", "--shield", "certified"),
             "observations of consensus_v0 have no column 'radius'",
         ),
-        (("run", "mixed_fleet", "--shield", "none"), "the safety filter is for integrators in the plane"),
+        (("run", "mixed_fleet", "--shield", "none"), "the safety filter can't hold 'vessel_0'"),
         (("evaluate", *PLAYED, "--policies", "filter:margin=none:"), "expected filter:OPTION=VALUE,...:POLICY"),
         (("run", *PLAYED, "--shield", "certified", "--env", "bounds=false"), "with bounds=True"),
         (("train", *PLAYED, "--shield", "safe"), "margin must be 'certified', 'none' or a number of metres"),

@@ -6,6 +6,7 @@ docs/theory_safety.md has the theorem, and where each margin comes from.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -49,18 +50,20 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
     constant = 0.0 if isinstance(margin, str) else margin
     tracking: dict[str, FloatArray] = {}  # largest distance between an agent and its anchor
     for agent, model in env.models.items():
-        _require_integrator(agent, model, env.layouts[agent])
-        tracking[agent] = _tracking(agent, env)
-    own, of_bodies, first, start = [], [], [0], 0
+        require_model(agent, model, env.layouts[agent], DRIFT)
+        tracking[agent] = tracking_of(agent, env)
+    own, ofbodies, first, start = [], [], [0], 0
     pairs: list[tuple[IntArray, FloatArray, IntArray, FloatArray, int, FloatArray, float]] = []
     announced: list[tuple[IntArray, int, float, FloatArray]] = []
     pace = {agent: _pace(model) if announce else np.full(2, math.inf) for agent, model in env.models.items()}
     for agent, layout in env.layouts.items():
         if certified:
-            _require_all_known(agent, layout, env)
+            require_all_known(agent, layout, env)
         place = _own(agent, env)
-        own.append((start + place, layout.high[place].astype(float), 1.01 * (tracking[agent] + _rounding(agent, env))))
-        of_bodies.append(bodies(agent, env, start, radius))
+        own.append(
+            (start + place, layout.high[place].astype(float), 1.01 * (tracking[agent] + rounding_of(agent, env)))
+        )
+        ofbodies.append(bodies(agent, env, start, radius))
         for number, slot in enumerate(layout.slots):
             name, other = f"slot{number}", tracking.get(slot.id, np.zeros(2))
             place = layout.columns(f"{name}.position")
@@ -70,7 +73,7 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
                 bound, highest = start + bound, layout.high[bound].astype(float)
             by_messages = f"{name}.age" in layout.names  # then boxes are right before anything has arrived, too
             valid = -1 if certified and by_messages else start + layout.index(f"{name}.valid")
-            widen = constant + other + _rounding(agent, env)
+            widen = constant + other + rounding_of(agent, env)
             apart = float(np.linalg.norm(tracking[agent]) + np.linalg.norm(other))
             pairs.append((start + place, layout.high[place].astype(float), bound, highest, valid, widen, apart))
             if announce:
@@ -82,7 +85,7 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
     if not pairs:
         raise ValueError(f"{env.environment} on {env.scenario} has no slots: nobody knows of anybody")
     columns, limits, tracked = map(np.array, zip(*own, strict=True))
-    radius_column, obstacle = map(np.array, zip(*of_bodies, strict=True))
+    radius_column, obstacle = map(np.array, zip(*ofbodies, strict=True))
     position, position_limit, bounds, bound_limit, valid_column, widened, distances = map(
         np.array, zip(*pairs, strict=True)
     )
@@ -107,7 +110,7 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
         math.nan if radius is None else radius,
         distances,
         obstacle,
-        np.array([_rounding(agent, env) for agent in env.agents]),
+        np.array([rounding_of(agent, env) for agent in env.agents]),
         np.array([np.linalg.norm(tracking[agent]) for agent in env.agents]),
         speed,
         tracked,
@@ -184,13 +187,22 @@ def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) ->
     return column, np.array(places, np.int64).reshape(-1, 2)
 
 
-def _rounding(agent: str, env: EnvDescription) -> FloatArray:
-    """(2,) largest rounding of an agent's own position in observations, in m."""
+def rounding_of(agent: str, env: EnvDescription) -> FloatArray:
+    """(2,) largest rounding of an agent's own position in observations, in m.
+
+    Args:
+        agent: its id.
+        env: the environment.
+    """
     return FLOAT32 * env.layouts[agent].high[_own(agent, env)].astype(float)
 
 
-def _tracking(agent: str, env: EnvDescription) -> FloatArray:
-    """(2,) largest distance per axis between an agent and its anchor, in m.
+def tracking_of(agent: str, env: EnvDescription) -> FloatArray:
+    """(2,) largest distance per axis between an integrator and its anchor, in m.
+
+    Args:
+        agent: its id.
+        env: the environment.
 
     Raises:
         ValueError: if its inputs don't suffice to keep it there, or its disturbance isn't known.
@@ -201,10 +213,10 @@ def _tracking(agent: str, env: EnvDescription) -> FloatArray:
     speed, pushed = np.asarray(model.input_limit, float), np.asarray(env.disturbance[agent], float)
     growth, drift = model.drift_growth(), DRIFT[type(model)]
     assert growth is not None
-    reach = (speed + drift + pushed) * period + _rounding(agent, env)
+    reach = (speed + drift + pushed) * period + rounding_of(agent, env)
     pushed = pushed + growth.matrix @ reach  # the drift isn't what it was at the beginning of the period
-    found: FloatArray = pushed * period + _rounding(agent, env) + FLOAT32 * speed * period
-    if not (1.01 * (found + _rounding(agent, env)) + drift * period <= speed * period).all():
+    found: FloatArray = pushed * period + rounding_of(agent, env) + FLOAT32 * speed * period
+    if not (1.01 * (found + rounding_of(agent, env)) + drift * period <= speed * period).all():
         raise ValueError(
             f"{agent!r} can't hold its place: it is pushed at up to {pushed.max() + drift:g} m/s, and its inputs are "
             f"limited to {speed.min():g} m/s"
@@ -228,12 +240,25 @@ def _is_bound(name: str) -> bool:
     return slot.startswith("slot") and rest.startswith("bound.")
 
 
-def _require_integrator(agent: str, model: AgentModel, layout: ObservationLayout) -> None:
-    if type(model) not in DRIFT or len(model.position) != 2:
+def require_model(
+    agent: str, model: AgentModel, layout: ObservationLayout, models: Collection[type[AgentModel]]
+) -> None:
+    """Refuse agents of other models, or not in the plane, or whose inputs aren't the actions.
+
+    Args:
+        agent: its id.
+        model: its model.
+        layout: of its observations.
+        models: that are possible.
+
+    Raises:
+        ValueError: naming the agent and what is possible.
+    """
+    if type(model) not in models or len(model.position) != 2:
+        names = ", ".join(f"{each.__name__}({'dim=2' * (each is SingleIntegrator)})" for each in models)
+        dim = f" of dimension {model.dim}" if isinstance(model, SingleIntegrator) else ""
         raise ValueError(
-            "the safety filter is for integrators in the plane, SingleIntegrator(dim=2) and DriftingIntegrator(); "
-            f"{agent!r} is a {type(model).__name__}"
-            + (f" of dimension {model.dim}" if isinstance(model, SingleIntegrator) else "")
+            f"the safety filter is for agents in the plane, {names}; {agent!r} is a {type(model).__name__}{dim}"
         )
     if any(name.startswith("own.input") for name in layout.names):
         raise ValueError(
@@ -242,8 +267,17 @@ def _require_integrator(agent: str, model: AgentModel, layout: ObservationLayout
         )
 
 
-def _require_all_known(agent: str, layout: ObservationLayout, env: EnvDescription) -> None:
-    """Refuse what the theorem doesn't cover."""
+def require_all_known(agent: str, layout: ObservationLayout, env: EnvDescription) -> None:
+    """Refuse what the theorem doesn't cover.
+
+    Args:
+        agent: its id.
+        layout: of its observations.
+        env: the environment.
+
+    Raises:
+        ValueError: if others aren't known, or don't run the filter, or without bounds.
+    """
     if env.observe == "local":
         raise ValueError(
             "margin='certified' needs observe='estimate' or 'oracle': with 'local' most agents are unknown"

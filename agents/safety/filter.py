@@ -16,11 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.others import Others, side_by_side
 from agents.policy import EnvDescription, Observations, Policy
-from agents.safety.columns import ANNOUNCED, Margin, read_columns, without_bounds
+from agents.safety.columns import ANNOUNCED, DRIFT, Margin, read_columns, without_bounds
+from agents.safety.driving import drive
 from agents.safety.moves import filter_moves, periods_of_rest
+from agents.safety.teams import read_team
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray, IntArray
-from khop_env.physics import SingleIntegrator
+from khop_env.physics import DriftingIntegrator
+
+_REMEMBERED = "anchor", "started", "resting", "memory"
 
 
 def as_margin(margin: Margin) -> Margin:
@@ -45,17 +49,19 @@ class SafetyFilter:
         policy = SafetyFilter(make_policy("tanh"), radius=0.2)       # in an environment made with bounds=True
         policy = shielded("tanh", margin=0.3, radius=0.2)            # a constant margin: no guarantee
 
-    It reads observations only, as a policy does, and remembers each agent's anchor: where its moves so far would have
-    brought it without a disturbance. Agents have to be integrators in the plane, with a drift or without, whose inputs
-    are their actions (actuator="direct"). With margin="certified" the distance is kept whatever the network does,
-    provided that all agents run the filter and start apart (docs/theory_safety.md); with other margins it is not.
+    It reads observations only, as a policy does, and remembers each agent's anchor: where its inputs so far would have
+    brought it without a disturbance. Agents have to be the library's own models in the plane, whose inputs are their
+    actions (actuator="direct"); teams may mix them. Integrators move to the nearest admitted place; unicycles, and
+    carts and ships, which have to brake, always keep a way to stop. With margin="certified" the distance is kept
+    whatever the network does, provided that all agents run the filter and start apart (docs/theory_safety.md); with
+    other margins it is not.
 
     Args:
         policy: the policy inside; it gets the observations without bounds, unless it was trained with them. None for a
             filter that only corrects actions that it is given.
         margin: a `Margin`.
         gamma: share of the gap that two agents may use up in a period together, above 0 and at most 1.
-        announce: whether agents send their anchors in messages, so that neither disturbances nor noise widen the boxes.
+        announce: whether integrators send their anchors in messages, so that disturbances and noise don't widen boxes.
             Anchors then keep to the speed limit, so that an action may be changed where nothing is near, too.
         radius: of an agent's body in m; None for the column `radius` of observations.
         bounds: whether the policy inside observes bounds; None for what a learned policy was trained with, and no
@@ -70,7 +76,8 @@ class SafetyFilter:
         needs_bounds: whether the environment must be made with bounds=True.
         needs_messages: the least message_size of the environment; the last of these numbers are the filter's.
         wanted: by agent (..., m), the actions of the policy inside, of the last `act` or `correct`.
-        correction: by agent (..., 2), chosen less wanted input in m/s, of the last one.
+        correction: by agent (..., 2), chosen less wanted input along the axes of positions, of the last one: of the
+            velocity in m/s, of carts' and ships' acceleration in m/s^2.
         intervention: by agent (...), its length.
         infeasible: by agent (...), True where the guarantee had to be begun anew: an agent that isn't where its last
             input should have brought it, which then starts from where it is, or that is outside of what observations
@@ -124,12 +131,20 @@ class SafetyFilter:
             ValueError: if the filter or the policy inside doesn't fit the environment; the message says why.
         """
         self._env = env
-        columns = read_columns(env, self.margin, self.radius, self.announce)
+        self._brakes = any(type(model) not in DRIFT for model in env.models.values())
+        if self._brakes:
+            if self.announce:
+                raise ValueError("announce=True is for teams of integrators only: leave it out, or choose such a team")
+            team = read_team(env, self.margin, self.radius)
+            self._columns: Any = tuple(team)
+            self._limit, self._own, self._pairs = team.limit, team.own[:, :2], len(team.pair)
+        else:
+            columns = read_columns(env, self.margin, self.radius, self.announce)
+            self._columns, self._scale = tuple(columns), columns.scale
+            self._limit, self._own, self._pairs = columns.speed, columns.own, 0
         self._others = _held(env) if self.dead_reckoning else None
-        self._columns: Any = tuple(columns)
-        self._speed, self._own, self._scale = columns.speed, columns.own, columns.scale
         models = enumerate(env.models.values())
-        self._drifting = {number: model for number, model in models if not isinstance(model, SingleIntegrator)}
+        self._drifting = {number: model for number, model in models if isinstance(model, DriftingIntegrator)}
         self.begin(0)
         self._kept, inside = without_bounds(env, self._observes_bounds(env), self.needs_messages)
         self.inside = replace(inside, shielded=True)
@@ -168,7 +183,7 @@ class SafetyFilter:
                     f"reset for; it got {observations[agent].shape[-1]}"
                 )
         self.wanted = {agent: _numbers(agent, action) for agent, action in actions.items()}
-        flat = side_by_side(observations, agents)
+        flat = np.ascontiguousarray(side_by_side(observations, agents))
         if self._others is not None:
             self._others.update(flat)
             flat = self._others.extrapolated(flat)
@@ -178,30 +193,25 @@ class SafetyFilter:
                 raise ValueError(f"the batch of observations changed from {len(self._started)} to {batch}: reset first")
             self.begin(batch)
         fractions = np.stack([self._wanted(agent, batch) for agent in agents], axis=1)
-        speed = self._speed
-        wanted = np.clip(fractions, -1.0, 1.0, dtype=np.float64) * speed
+        limit, period, drift = self._limit, self._env.control_period, self._drift(flat)
+        wanted = np.clip(fractions, -1.0, 1.0, dtype=np.float64) * limit
         chosen, infeasible = np.empty_like(wanted), np.empty((batch, len(agents)), np.bool_)
-        filter_moves(
-            self._columns,
-            flat,
-            wanted,
-            self._drift(flat),
-            self._env.control_period,
-            self.gamma,
-            self._anchor,
-            self._started,
-            self._resting,
-            chosen,
-            infeasible,
-        )
-        correction = chosen - wanted
+        memory, found = (self._anchor, self._started), (chosen, infeasible)
+        if self._brakes:
+            correction = np.empty((batch, len(agents), 2))
+            drive(self._columns, flat, wanted, drift, period, self.gamma, *memory, self._memory, *found, correction)
+        else:
+            filter_moves(self._columns, flat, wanted, drift, period, self.gamma, *memory, self._resting, *found)
+            correction = chosen - wanted
         change = np.linalg.norm(correction, axis=2)
-        safe = np.where((change > 0.0)[..., None], chosen / speed, fractions).astype(np.float32)
+        changed = (np.linalg.norm(chosen - wanted, axis=2) > 0.0)[..., None]  # what isn't finite is refused later
+        safe = np.where(changed, chosen / np.where(limit > 0.0, limit, 1.0), fractions).astype(np.float32)
         corrected = {}
         for number, agent in enumerate(agents):
             action = np.zeros((batch, self._env.action_sizes[agent]), np.float32)
             action[:, : self._sizes[agent]] = self.wanted[agent].reshape(batch, -1)
-            action[:, :2] = safe[:, number]
+            inputs = self._env.models[agent].m
+            action[:, :inputs] = safe[:, number, :inputs]
             if self.announce:
                 anchor = self._anchor[:, number] / self._scale
                 action[:, -ANNOUNCED:-2] = anchor
@@ -222,21 +232,23 @@ class SafetyFilter:
         """
         if env_ids is None:
             shape = batch, len(self._env.agents)
-            self._anchor, self._started = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
+            self._anchor, self._started = np.zeros((*shape, 4 if self._brakes else 2)), np.zeros(shape, np.bool_)
             self._resting = np.zeros(shape, np.int64)
+            self._memory = np.full((batch, self._pairs, 8), np.nan)
         elif len(self._started):
             self._started[env_ids], self._resting[env_ids] = False, 0
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """A copy of what the filter remembers between actions."""
-        return {"anchor": self._anchor.copy(), "started": self._started.copy(), "resting": self._resting.copy()}
+        return {name: getattr(self, f"_{name}").copy() for name in _REMEMBERED}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Continue from `get_state()`'s result, after a reset in the same environment."""
-        self._anchor, self._started, self._resting = (state[name].copy() for name in ("anchor", "started", "resting"))
+        for name in _REMEMBERED:
+            setattr(self, f"_{name}", state[name].copy())
 
     def _wanted(self, agent: str, batch: int) -> Float32Array:
-        """(B, 2) what the policy inside wants of an agent."""
+        """(B, M) what the policy inside wants of an agent, with zeros after its inputs."""
         if agent not in self.wanted:
             raise ValueError(f"the safety filter got no action for {agent!r}")
         wanted, expected = self.wanted[agent], (batch, self._sizes[agent])
@@ -245,7 +257,9 @@ class SafetyFilter:
                 f"actions of {agent!r} must have shape {expected}, one row per environment; the safety filter got "
                 f"{wanted.shape}"
             )
-        return wanted.reshape(expected)[:, :2]
+        inputs, found = self._env.models[agent].m, np.zeros((batch, self._limit.shape[1]), np.float32)
+        found[:, :inputs] = wanted.reshape(expected)[:, :inputs]
+        return found
 
     def _drift(self, flat: Float32Array) -> FloatArray:
         """(B, N, 2) velocities of agents without an input."""

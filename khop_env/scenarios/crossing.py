@@ -37,7 +37,8 @@ def crossing(
         model: "integrator", "drifter", "cart", "unicycle" or "vessel", for all agents.
         graph: of communication: "tree" (random, for 8 agents the paper's), "ring", or "regular3", where all have 3
             links.
-        disturbance: amplitude of a sinusoid in m/s along each axis (on accelerations, in m/s^2, where there are some).
+        disturbance: amplitude of a sinusoid in m/s along each axis (on accelerations, in m/s^2, where there are some;
+            of a unicycle on its heading only, in rad/s).
         loss: mean share of lost messages, of which every agent sends 20 a second.
         burst: mean number of messages lost in a row.
         continuous: exchange in continuous time instead, without messages: the paper's observers and their bounds.

@@ -39,7 +39,8 @@ TEAM_MODELS: dict[str, Callable[[float], AgentModel]] = {
 }
 """By name: agents that move at most at a speed in m/s along each axis."""
 
-_PUSHED = {"cart": (0, 0, 1, 1), "unicycle": (1, 1, 0), "vessel": (0, 0, 0, 1, 1, 0)}  # states; else all
+# States that are disturbed; else all. Wheels don't slip: what pushed a unicycle sideways, no input could undo.
+_PUSHED = {"cart": (0, 0, 1, 1), "unicycle": (0, 0, 1), "vessel": (0, 0, 0, 1, 1, 0)}
 _REST = {"cart": (0.0, 0.0), "unicycle": (math.pi,), "vessel": (math.pi, 0.0, 0.0, 0.0)}  # half widths beside positions
 
 

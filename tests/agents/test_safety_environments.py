@@ -157,7 +157,7 @@ def test_a_policy_that_leaves_agents_out_is_named():
         ({}, CIRCLE, {}, "make the environment with bounds=True"),
         ({"bounds": True, "actuator": "lag"}, CIRCLE, {}, "actuator='direct'; the inputs of 'integrator_0' are states"),
         ({"bounds": True, "observe": "local"}, CIRCLE, {}, "needs observe='estimate' or 'oracle'"),
-        ({"bounds": True}, "mixed_fleet", {}, "'cart_0' is a DoubleIntegrator"),
+        ({"bounds": True}, "mixed_fleet", {}, "the disturbance pushes 'unicycle_0' aside"),
         ({"bounds": True}, circle(5, k=2), {}, "'integrator_0' doesn't know of integrator_3, integrator_4"),
         (
             {},

@@ -224,7 +224,7 @@ def test_shields_are_checked():
     with pytest.raises(ValueError, match=r"margin must be 'certified', 'none' or a number of metres.*'safe'"):
         dataclasses.replace(TINY, shield="safe")
     assert dataclasses.replace(TINY, shield=0.3).shield == "0.3"
-    with pytest.raises(ValueError, match="'cart_0' is a DoubleIntegrator"):
+    with pytest.raises(ValueError, match="the disturbance pushes 'unicycle_0' aside"):
         training_environment(
             dataclasses.replace(TINY, environment="consensus_v0", scenario="mixed_fleet", arguments={})
         )
