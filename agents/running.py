@@ -24,7 +24,8 @@ from khop_env.results.recording import Drawing, StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
 
-ARROW_TIME = 0.5  # s: frames show a filter's correction of a velocity as the way of this time
+ARROW_TIME = 0.5  # s: frames show a filter's correction of a velocity as the way of this time,
+ARROW_LENGTH = 0.75  # m: at most so long
 
 
 class PolicyRun:
@@ -95,7 +96,9 @@ class PolicyRun:
         """
         actions: Mapping[str, Any] = self._guarded(self.policy.act, self._observations)
         if correction := getattr(self.policy, "correction", None):  # a filter's, by agent in m/s, for frames
-            self.env.batched.world.arrows = ARROW_TIME * np.stack(list(correction.values()))[..., None]
+            arrows = ARROW_TIME * np.stack(list(correction.values()))[..., None]
+            length = np.linalg.norm(arrows, axis=1, keepdims=True)
+            self.env.batched.world.arrows = arrows / np.maximum(length / ARROW_LENGTH, 1.0)
         if infeasible := getattr(self.policy, "infeasible", None):
             self.env.batched.world.marked = np.stack(list(infeasible.values()))[:, None]
         self._observations, rewards, *_ = self._guarded(self.env.step, actions)

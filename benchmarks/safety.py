@@ -17,14 +17,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents import make_policy, play, shielded
+from agents.navigation import GoToGoal
 from agents.policies import needs
-from agents.policy import EnvDescription, Observations, Policy
+from agents.policy import EnvDescription, Policy
 from benchmarks.report import Report
 from khop_env.env import BatchedEnv
-from khop_env.env.layout import Float32Array
 from khop_env.network import Network, Outage, RandomLinks, Range, Schedule
+from khop_env.observers import FloatArray
 from khop_env.registry import make_batched, scenario
 from khop_env.results.recording import Progress as Fraction
+from khop_env.scenarios.teams import TEAM_MODELS
 from khop_env.terminal import Progress, print_table, print_text, say
 
 FAMILIES = ("swap", "crossing")
@@ -61,26 +63,24 @@ CONDITIONS: Mapping[str, Condition] = MappingProxyType(
 )
 
 
-class RammingPolicy:
-    """Full inputs straight at the nearest other, as far as it is known: an adversary of the filter."""
+class RammingPolicy(GoToGoal):
+    """At full speed straight at the nearest other, as far as it is known: an adversary of the filter."""
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Look up the columns of others' positions."""
+        super().reset(env, seeds)
         self._ways, self._known = {}, {}
         for agent, layout in env.layouts.items():
             slots = range(len(layout.slots))
             self._ways[agent] = np.stack([layout.columns(f"slot{number}.position") for number in slots])
             self._known[agent] = np.array([layout.index(f"slot{number}.valid") for number in slots])
 
-    def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """Actions of which one entry is -1 or 1."""
-        actions = {}
-        for agent, values in observations.items():
-            ways = values[:, self._ways[agent]]
-            far = np.where(values[:, self._known[agent]] > 0.5, np.square(ways).sum(axis=2), np.inf)
-            way = np.take_along_axis(ways, np.argmin(far, axis=1)[:, None, None], axis=1)[:, 0]
-            actions[agent] = way / np.maximum(np.abs(way).max(axis=1, keepdims=True), 1e-9)
-        return actions
+    def way(self, agent: str, position: FloatArray, seen: FloatArray) -> FloatArray:
+        """Far beyond the nearest other."""
+        ways = seen[:, self._ways[agent]]
+        far = np.where(seen[:, self._known[agent]] > 0.5, np.square(ways).sum(axis=2), np.inf)
+        nearest: FloatArray = np.take_along_axis(ways, np.argmin(far, axis=1)[:, None, None], axis=1)[:, 0]
+        return 100.0 * nearest
 
 
 POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
@@ -126,6 +126,7 @@ def collisions(
     episodes: int,
     seed: int = 0,
     *,
+    model: str = "integrator",
     durations: Mapping[int, float] = DURATIONS,
     progress: Fraction | None = None,
 ) -> Iterator[Count]:
@@ -137,6 +138,7 @@ def collisions(
     Args:
         episodes: with certified bounds.
         seed: of the order, and of the first episode of each combination.
+        model: of all agents, as the scenarios name it; only integrators and drifters announce anchors.
         durations: numbers of agents, and the length of their episodes in s.
         progress: called with the completed fraction.
     """
@@ -150,13 +152,14 @@ def collisions(
     for (family, agents, condition, name), count, done in zip(cells, counts, work, strict=True):
         if (family, agents, condition) != before:
             made, before = {}, (family, agents, condition)
-        parts = -(-count // 2), count // 2, -(-count // SHARE)
+        announced = count // 2 if model in ("integrator", "drifter") else 0
+        parts = count - announced, announced, -(-count // SHARE)
         for (kind, options), part in zip(FILTERS.items(), parts, strict=True):
             if not part:
                 continue
             policy, batch = shielded(POLICIES[name](), **options), min(part, _BATCH)
             if kind not in made or made[kind].num_envs < batch:
-                made[kind] = environment(family, agents, condition, durations[agents], batch, policy)
+                made[kind] = environment(_scenario(family, agents, model), condition, durations[agents], batch, policy)
             found = play(made[kind], policy, range(seed, seed + part)).outcomes
             yield Count(
                 family,
@@ -173,11 +176,11 @@ def collisions(
             progress(float(done / work[-1]))
 
 
-def environment(family: str, agents: int, condition: str, duration: float, num_envs: int, policy: Policy) -> BatchedEnv:
+def environment(name: str, condition: str, duration: float, num_envs: int, policy: Policy) -> BatchedEnv:
     """The environment of a combination, with what the policy needs."""
     network, schedule = CONDITIONS[condition]
     graph = "tree" if schedule is None else "regular3"
-    chosen = scenario(f"{family}:agents={agents},graph={graph},duration={duration:g}")
+    chosen = scenario(f"{name},graph={graph},duration={duration:g}")
     arguments = needs(policy).among({"num_envs": num_envs, "network": network})
     return make_batched("navigation_v0", replace(chosen, schedule=schedule), **arguments)
 
@@ -260,8 +263,8 @@ def print_counts(counts: Sequence[Count]) -> None:
         )
 
 
-def _scenario(family: str, agents: int) -> str:
-    return f"{family}:agents={agents}"
+def _scenario(family: str, agents: int, model: str = "integrator") -> str:
+    return f"{family}:agents={agents}" + ("" if model == "integrator" else f",model={model}")
 
 
 def _scenario_of(count: Count) -> str:
@@ -283,6 +286,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--episodes", type=int, default=1000, help="with certified bounds; 1000 by default")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")
+    parser.add_argument(
+        "--model", choices=TEAM_MODELS, default="integrator", help="of all agents; by default integrator"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object with every count")
     chosen = parser.parse_args()
     if chosen.episodes < 1 or chosen.seed < 0:
@@ -291,13 +297,13 @@ def main() -> None:
     interrupted = False
     try:
         with Progress("counting collisions") as progress:
-            for each in collisions(chosen.episodes, chosen.seed, progress=progress):
+            for each in collisions(chosen.episodes, chosen.seed, model=chosen.model, progress=progress):
                 counts.append(each)
     except KeyboardInterrupt:
         interrupted = True
     if chosen.json:
         rows = [each._asdict() for each in counts]
-        print(json.dumps({"interrupted": interrupted, "totals": totals(counts), "rows": rows}))
+        print(json.dumps({"model": chosen.model, "interrupted": interrupted, "totals": totals(counts), "rows": rows}))
     elif counts:
         print_counts(counts)
     if interrupted:

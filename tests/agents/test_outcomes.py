@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from agents import compare, describe, make_policy, play
 from agents.outcomes import wilson95
 from agents.policy import policy_seeds
-from agents.running import policy_run
+from agents.running import PolicyRun, policy_run
 from khop_env import make_batched, navigation_v0
 from khop_env.cli import app
 from khop_env.registry import scenario
@@ -156,3 +156,14 @@ def test_a_run_has_the_outcomes_of_an_evaluation():
         for name, value in run.outcomes.items():
             np.testing.assert_array_equal(value, expected[name], name)
     assert policy_run("zero", scenario("paper"), "estimate", 0.1, 0).outcomes == {}
+
+
+@pytest.mark.parametrize(("change", "length"), [(0.5, 0.25), (50.0, 0.75)])
+def test_arrows_in_frames_point_along_corrections(change, length):
+    """As far as they lead in half a second, and never across the picture."""
+    run = PolicyRun(navigation_v0.parallel_env("swap:agents=4"), Slowed(), 0)
+    assert run.env.batched.world.arrows is None
+    run.policy.correction = {agent: change * np.array([0.6, -0.8]) for agent in run.env.possible_agents}
+    run.step(0.05)
+    np.testing.assert_allclose(run.env.batched.world.arrows[..., 0], length * np.tile([0.6, -0.8], (4, 1)))
+    assert run.env.batched.world.marked.shape == (4, 1)

@@ -39,7 +39,7 @@ def test_limits_of_a_rate():
 def test_an_interrupt_loses_nothing(counted, monkeypatch, capsys, form):
     """What was counted until then is printed, and the status is that of an interrupted command."""
 
-    def stopped(episodes, seed, progress):
+    def stopped(episodes, seed, model, progress):
         yield from counted[:3]
         raise KeyboardInterrupt
 
