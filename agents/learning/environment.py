@@ -48,11 +48,19 @@ class TrainingVecEnv(VecEnvWrapper):
         venv: the environment.
         scaler: computes the features.
         huber: error above which rewards are linear in it, in the unit of the task error.
+        intervention: taken from rewards for every metre by which a shield changes an agent's way.
     """
 
-    def __init__(self, venv: KHopSB3VecEnv | ShieldedSB3VecEnv, scaler: ObservationScaler, huber: float) -> None:
+    def __init__(
+        self,
+        venv: KHopSB3VecEnv | ShieldedSB3VecEnv,
+        scaler: ObservationScaler,
+        huber: float,
+        intervention: float = 0.0,
+    ) -> None:
         super().__init__(venv, Box(-MOST, MOST, (scaler.size,), np.float32))
         self.batched, self.scaler, self._huber = venv.batched, scaler, huber
+        self._intervention = intervention * self.batched.settings.control_period
         self.shield = venv if isinstance(venv, ShieldedSB3VecEnv) else None
         self.source: KHopSB3VecEnv = venv.venv if isinstance(venv, ShieldedSB3VecEnv) else venv  # type: ignore[assignment]
         self.before = np.zeros(0, np.float32)  # observations of the previous step
@@ -71,6 +79,9 @@ class TrainingVecEnv(VecEnvWrapper):
         current, before = np.asarray(observations), self.before
         by_env = np.asarray(reward).reshape(self.batched.num_envs, -1)
         softened = self.batched.task.robust_reward(by_env, self.source.infos, self._huber)
+        if self.shield is not None and self._intervention:
+            changed = np.stack([self.shield.filter.intervention[agent] for agent in self.batched.agents], axis=1)
+            softened = softened - self._intervention * changed
         rows = np.flatnonzero(done)
         if rows.size:
             last = self.scaler(np.stack([infos[row]["terminal_observation"] for row in rows]), before[rows])
@@ -90,7 +101,7 @@ def training_environment(config: TrainingConfig) -> VecNormalize:
     if config.shield is not None:
         rows = ShieldedSB3VecEnv(inner, safety_filter(str(config.shield), None, config.bounds))
     scaler = ObservationScaler.of(described(batched, config), config.rates, config.nearest)
-    wrapped = TrainingVecEnv(rows, scaler, config.huber)
+    wrapped = TrainingVecEnv(rows, scaler, config.huber, config.intervention)
     return VecNormalize(wrapped, norm_obs=False, norm_reward=True, gamma=config.gamma)
 
 

@@ -228,3 +228,22 @@ def test_shields_are_checked():
         training_environment(
             dataclasses.replace(TINY, environment="consensus_v0", scenario="mixed_fleet", arguments={})
         )
+
+
+def test_interventions_are_taken_from_the_training_reward():
+    """By metre, of the agent whose action was changed; not from the environment's own reward."""
+    config = dataclasses.replace(TINY, arguments={"max_cycles": 100})
+    both = [training_environment(dataclasses.replace(config, intervention=each)) for each in (0.0, 2.0)]
+    for env in both:
+        env.training = env.norm_reward = False
+        env.seed(0)
+        env.reset()
+    rng, shield = np.random.default_rng(0), both[0].venv.shield
+    taken = []
+    for _ in range(60):
+        actions = rng.uniform(-1, 1, (32, 2)).astype(np.float32)
+        plain, less = (env.step(actions)[1] for env in both)
+        changed = np.stack([shield.filter.intervention[agent] for agent in shield.batched.agents], axis=1)
+        np.testing.assert_allclose(plain - less, 2.0 * 0.05 * changed.reshape(-1), atol=1e-6)
+        taken.append(changed.max())
+    assert max(taken) > 0.1
