@@ -42,6 +42,9 @@ class TrainingConfig:
         nearest: whether networks get other agents in the order of their distances, and not in that of the slots.
         shield: a safety filter that corrects actions before the environment gets them: its margin, "certified", "none"
             or a number of m, and options after commas, "certified,announce=true"; None for no filter.
+        intervention: taken from the training reward for every metre by which the shield changes an agent's way.
+        saturation: taken from the training reward per second for the squared excess of actions over [-1, 1], beyond
+            which exploration has no effect; 0 for none.
         initial: folder of another run, of which policy, value function and exploration are taken on, or a policy's
             file; None for random networks.
         algorithm: learning algorithm, "ppo" or "sac".
@@ -74,6 +77,8 @@ class TrainingConfig:
     rates: bool = True
     nearest: bool = False
     shield: str | float | None = None
+    intervention: float = 0.0
+    saturation: float = 0.0
     initial: str | None = None
     algorithm: Algorithm = "ppo"
     per_type: bool = False
@@ -122,6 +127,9 @@ class TrainingConfig:
         for name in ("learning_rate", "clip_range", "huber"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)!r}")
+        for name in ("intervention", "saturation"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be non-negative and finite; got {getattr(self, name)!r}")
         if not 0.0 <= self.entropy < math.inf or not math.isfinite(self.log_std):
             raise ValueError(
                 f"entropy must be non-negative and finite, log_std finite; got {self.entropy!r} and {self.log_std!r}"

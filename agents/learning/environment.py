@@ -17,6 +17,7 @@ from agents.policy import EnvDescription, describe
 from khop_env.env import BatchedEnv
 from khop_env.env.layout import Float32Array
 from khop_env.env.sb3 import KHopSB3VecEnv
+from khop_env.observers import FloatArray
 from khop_env.registry import make_batched
 
 
@@ -39,6 +40,9 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
     return make_batched(config.environment, **where, num_envs=count, observe=config.observe, **arguments)
 
 
+WIDE = 4.0  # actions of a learner whose excess over [-1, 1] counts
+
+
 class TrainingVecEnv(VecEnvWrapper):
     """Computes features of observations, and rewards not dominated by rare large errors (`Task.robust_reward`).
 
@@ -47,15 +51,21 @@ class TrainingVecEnv(VecEnvWrapper):
     Args:
         venv: the environment.
         scaler: computes the features.
-        huber: error above which rewards are linear in it, in the unit of the task error.
+        config: its `huber`, `intervention` and `saturation` say how rewards are changed.
     """
 
-    def __init__(self, venv: KHopSB3VecEnv | ShieldedSB3VecEnv, scaler: ObservationScaler, huber: float) -> None:
-        super().__init__(venv, Box(-MOST, MOST, (scaler.size,), np.float32))
-        self.batched, self.scaler, self._huber = venv.batched, scaler, huber
+    def __init__(
+        self, venv: KHopSB3VecEnv | ShieldedSB3VecEnv, scaler: ObservationScaler, config: TrainingConfig
+    ) -> None:
+        actions = venv.action_space
+        if config.saturation:  # Stable-Baselines3 clips actions to their space: a wider one shows how far they go
+            actions = Box(-WIDE, WIDE, actions.shape, np.float32)
+        super().__init__(venv, Box(-MOST, MOST, (scaler.size,), np.float32), actions)
+        self.batched, self.scaler, self._config = venv.batched, scaler, config
         self.shield = venv if isinstance(venv, ShieldedSB3VecEnv) else None
         self.source: KHopSB3VecEnv = venv.venv if isinstance(venv, ShieldedSB3VecEnv) else venv  # type: ignore[assignment]
         self.before = np.zeros(0, np.float32)  # observations of the previous step
+        self._excess: FloatArray | float = 0.0
 
     def reset(self) -> Float32Array:
         """Start new, staggered episodes; features (num_envs * N, size)."""
@@ -65,12 +75,26 @@ class TrainingVecEnv(VecEnvWrapper):
         self.batched.set_state(dataclasses.replace(state, cycles=staggered))
         return self.scaler(self.before, None)
 
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions (rows, m)."""
+        if self._config.saturation:
+            inside = np.clip(actions, -1.0, 1.0)
+            self._excess = np.square(actions - inside, dtype=float).sum(axis=1).reshape(self.batched.num_envs, -1)
+            actions = inside
+        self.venv.step_async(actions)
+
     def step_wait(self) -> tuple[Float32Array, Float32Array, np.ndarray, list[dict[str, Any]]]:
         """Advance by one control period; features, robust rewards, dones and infos, one row per agent."""
         observations, reward, done, infos = self.venv.step_wait()
-        current, before = np.asarray(observations), self.before
+        current, before, config = np.asarray(observations), self.before, self._config
         by_env = np.asarray(reward).reshape(self.batched.num_envs, -1)
-        softened = self.batched.task.robust_reward(by_env, self.source.infos, self._huber)
+        softened = self.batched.task.robust_reward(by_env, self.source.infos, config.huber)
+        period = self.batched.settings.control_period
+        if self.shield is not None and config.intervention:
+            changed = np.stack([self.shield.filter.intervention[agent] for agent in self.batched.agents], axis=1)
+            softened = softened - config.intervention * period * changed
+        if config.saturation:
+            softened = softened - config.saturation * period * self._excess
         rows = np.flatnonzero(done)
         if rows.size:
             last = self.scaler(np.stack([infos[row]["terminal_observation"] for row in rows]), before[rows])
@@ -90,7 +114,7 @@ def training_environment(config: TrainingConfig) -> VecNormalize:
     if config.shield is not None:
         rows = ShieldedSB3VecEnv(inner, safety_filter(str(config.shield), None, config.bounds))
     scaler = ObservationScaler.of(described(batched, config), config.rates, config.nearest)
-    wrapped = TrainingVecEnv(rows, scaler, config.huber)
+    wrapped = TrainingVecEnv(rows, scaler, config)
     return VecNormalize(wrapped, norm_obs=False, norm_reward=True, gamma=config.gamma)
 
 

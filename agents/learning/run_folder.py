@@ -48,7 +48,14 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
     stored = saved.get("config")
     if not isinstance(stored, dict) or not isinstance(stored.get("timesteps"), int) or "fingerprint" not in saved:
         raise CheckpointError(f"{path} isn't a checkpoint that khop train wrote (it has no settings)")
-    stored = {"arguments": {}, "nearest": False, "shield": None, "initial": None, **stored}  # of earlier versions
+    stored = {
+        "arguments": {},
+        "nearest": False,
+        "shield": None,
+        "intervention": 0.0,
+        "initial": None,
+        **stored,
+    }  # of earlier versions
     differs = [key for key in current if stored.get(key) != current[key]]
     if stored["timesteps"] < config.timesteps:
         differs.remove("timesteps")

@@ -228,3 +228,41 @@ def test_shields_are_checked():
         training_environment(
             dataclasses.replace(TINY, environment="consensus_v0", scenario="mixed_fleet", arguments={})
         )
+
+
+def test_interventions_are_taken_from_the_training_reward():
+    """By metre, of the agent whose action was changed; not from the environment's own reward."""
+    config = dataclasses.replace(TINY, arguments={"max_cycles": 100})
+    both = [training_environment(dataclasses.replace(config, intervention=each)) for each in (0.0, 2.0)]
+    for env in both:
+        env.training = env.norm_reward = False
+        env.seed(0)
+        env.reset()
+    rng, shield = np.random.default_rng(0), both[0].venv.shield
+    taken = []
+    for _ in range(60):
+        actions = rng.uniform(-1, 1, (32, 2)).astype(np.float32)
+        plain, less = (env.step(actions)[1] for env in both)
+        changed = np.stack([shield.filter.intervention[agent] for agent in shield.batched.agents], axis=1)
+        np.testing.assert_allclose(plain - less, 2.0 * 0.05 * changed.reshape(-1), atol=1e-6)
+        taken.append(changed.max())
+    assert max(taken) > 0.1
+
+
+def test_actions_beyond_the_limits_cost_what_they_exceed_them_by():
+    """They act as if clipped, and everything else stays as it is."""
+    config = dataclasses.replace(TINY, shield=None, arguments={"max_cycles": 100})
+    both = [training_environment(dataclasses.replace(config, saturation=each)) for each in (0.0, 2.0)]
+    for env in both:
+        env.training = env.norm_reward = False
+        env.seed(0)
+        env.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        actions = rng.uniform(-3, 3, (32, 2)).astype(np.float32)
+        (first, plain, *_), (second, less, *_) = (env.step(actions) for env in both)
+        np.testing.assert_array_equal(first, second)
+        excess = np.square(np.maximum(np.abs(actions) - 1.0, 0.0)).sum(axis=1)
+        np.testing.assert_allclose(plain - less, 2.0 * 0.05 * excess, atol=1e-6)
+    trained = train(dataclasses.replace(config, saturation=0.5, timesteps=500, evaluations=1))
+    assert trained.policy.action_size == 2
