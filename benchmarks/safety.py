@@ -1,6 +1,6 @@
 """Count collisions under the safety filter: swap and crossing, over networks and changing graphs, with adversaries.
 
-python -m benchmarks.safety --episodes 10000         # eight minutes on a core
+python -m benchmarks.safety --episodes 10000         # a quarter of an hour on a core
 """
 
 from __future__ import annotations
