@@ -283,13 +283,34 @@ def test_policies_are_shipped():
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_shipped_policies_are_small_and_good(path):
-    """Each under a megabyte, far better than zero inputs, and much better on estimates than on neighbours only."""
+def test_shipped_policies_are_small_and_named_after_what_they_are_for(path):
     assert path.stat().st_size < 1_000_000
     about = LearnedPolicy.load(path).about
-    environment, scenario = about["environment"], about["scenario"]
-    assert path.stem == pretrained_name(environment, scenario)
+    assert path.stem == pretrained_name(about["environment"], about["scenario"])
     assert about["observe"] == "estimate"
+
+
+def test_the_shipped_policy_for_navigation_arrives_in_the_filter():
+    """Without collisions; played outside of it, it collides, and a warning says why."""
+    spec = "filter:announce=true:ppo:pretrained"
+    env = batched("navigation_v0", "crossing", num_envs=20, bounds=True, message_size=4)
+    found = play(env, make_policy(spec), range(5000, 5020)).outcomes
+    assert found["collision"].sum() == 0
+    assert found["success"].mean() > 0.7
+    plain = batched("navigation_v0", "crossing", num_envs=20)
+    with pytest.warns(UserWarning, match="trained inside the safety filter is played outside of it"):
+        found = play(plain, make_policy("ppo:pretrained"), range(5000, 5020)).outcomes
+    assert found["collision"].mean() > 0.5
+
+
+OTHERS = [path for path in SHIPPED if not path.stem.startswith("navigation_v0")]
+
+
+@pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.stem)
+def test_shipped_policies_are_good(path):
+    """Far better than zero inputs, and much better on estimates than on neighbours only."""
+    about = LearnedPolicy.load(path).about
+    environment, scenario = about["environment"], about["scenario"]
     found = {}
     for mode in ("estimate", "local"):
         env = batched(environment, scenario, num_envs=20, observe=mode)
