@@ -147,7 +147,8 @@ class ObservationScaler:
 def _slots(names: Sequence[str], dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Columns (S, C) of each slot and (S, dim) of its position; none without axes."""
     count = sum(name.endswith(".valid") for name in names) if dim else 0
-    slots = [[column for column, name in enumerate(names) if name.startswith(f"slot{q}.")] for q in range(count)]
+    fields = [name.partition(".")[2] for name in names if name.startswith("slot0.")]  # each slot has them
+    slots = [[names.index(f"slot{q}.{field}") for field in fields] for q in range(count)]
     places = [[names.index(f"slot{q}.position.{axis}") for axis in axis_names(dim)] for q in range(count)]
     return np.array(slots, np.int64).reshape(count, -1 if count else 0), np.array(places, np.int64).reshape(count, dim)
 

@@ -89,14 +89,15 @@ def test_scales_are_found_by_name(path):
     policy = LearnedPolicy.load(path)
     env = batched(policy.environment, policy.about["scenario"], num_envs=2)
     description = describe(env)
-    scaler = ObservationScaler.of(description, policy.about["rates"])
+    chosen = {"rates": policy.about["rates"], "nearest": policy.about.get("nearest", False)}
+    scaler = ObservationScaler.of(description, **chosen)
     assert same(scaler, policy.scaler)
     order = np.random.default_rng(0).permutation(len(scaler.scale))
     mixed = {
         agent: ObservationLayout(agent, [layout.fields[q] for q in order], layout.slots)
         for agent, layout in description.layouts.items()
     }
-    other = ObservationScaler.of(dataclasses.replace(description, layouts=mixed), policy.about["rates"])
+    other = ObservationScaler.of(dataclasses.replace(description, layouts=mixed), **chosen)
     before, _ = env.reset(0)
     after, *_ = env.step(np.ones((2, len(env.agents), policy.action_size)))
     found, expected = other(after[..., order], before[..., order]), scaler(after, before)
