@@ -147,7 +147,13 @@ class ObservationScaler:
 def _slots(names: Sequence[str], dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Columns (S, C) of each slot and (S, dim) of its position; none without axes."""
     count = sum(name.endswith(".valid") for name in names) if dim else 0
-    fields = [name.partition(".")[2] for name in names if name.startswith("slot0.")]  # each slot has them
+    fields = [name.partition(".")[2] for name in names if name.startswith("slot0.")]
+    missing = [f"slot{q}.{field}" for q in range(count) for field in fields if f"slot{q}.{field}" not in names]
+    if missing:
+        raise ValueError(
+            f"nearest=True needs slots with the same columns, and there is no {missing[0]}: "
+            "agents of several types have others"
+        )
     slots = [[names.index(f"slot{q}.{field}") for field in fields] for q in range(count)]
     places = [[names.index(f"slot{q}.position.{axis}") for axis in axis_names(dim)] for q in range(count)]
     return np.array(slots, np.int64).reshape(count, -1 if count else 0), np.array(places, np.int64).reshape(count, dim)

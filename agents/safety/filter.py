@@ -102,6 +102,10 @@ class SafetyFilter:
             raise ValueError(f"gamma must be above 0 and at most 1; got {gamma!r}")
         if radius is not None and not 0.0 < radius < math.inf:
             raise ValueError(f"radius must be a positive number of metres; got {radius!r}")
+        if policy is None and dead_reckoning:
+            raise ValueError(
+                "dead_reckoning=True is for a filter with a policy, which it begins anew with every episode"
+            )
         self.policy: Policy = _NoPolicy() if policy is None else policy
         self.margin, self.gamma = as_margin(margin), float(gamma)
         if announce and self.margin != "certified":
@@ -236,7 +240,7 @@ class SafetyFilter:
             self._resting = np.zeros(shape, np.int64)
             self._memory = np.full((batch, self._pairs, 8), np.nan)
         elif len(self._started):
-            self._started[env_ids], self._resting[env_ids] = False, 0
+            self._started[env_ids], self._resting[env_ids], self._memory[env_ids] = False, 0, np.nan
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """A copy of what the filter remembers between actions."""

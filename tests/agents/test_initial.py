@@ -69,7 +69,7 @@ def test_the_whole_of_sac_is_taken_on(tmp_path):
     [
         ({"hidden": (32, 32)}, r"trained with hidden = \[64, 64\], and this run has hidden = \[32, 32\]"),
         ({"rates": False}, "trained with rates = True, and this run has rates = False"),
-        ({"nearest": True}, "trained with nearest = False, and this run has nearest = True"),
+        ({"environment": "navigation_v0", "scenario": None}, "it was trained for consensus_v0, not for navigation_v0"),
         ({"bounds": True}, r"with \d+ observation columns; this environment has \d+"),
         ({"environment": "formation_v0"}, "it was trained for consensus_v0, not for formation_v0"),
         ({"algorithm": "sac"}, "trained with algorithm = 'ppo', and this run has algorithm = 'sac'"),

@@ -97,6 +97,7 @@ def test_rows_for_stable_baselines3_do_the_same(announce):
             np.testing.assert_array_equal(last, np.stack([kept[agent] for agent in agents], axis=1).reshape(24, -1))
             for agent in agents:
                 np.testing.assert_array_equal(rows.filter.intervention[agent], policy.intervention[agent])
+                assert not rows.filter.infeasible[agent].any()
         assert dones.all()
         assert [info["intervention"] for info in infos[:8]] == [
             float(policy.intervention[agent][0]) for agent in agents
@@ -140,7 +141,8 @@ def test_refused_actions_change_nothing():
     env = parallel()
     env.reset(1)
     fine = dict.fromkeys(env.agents, np.ones(2, np.float32))
-    env.step(fine)
+    for _ in range(20):  # until messages have arrived, and agents move
+        env.step(fine)
     before = env.filter.get_state()
     for actions, error, message in (
         ({**fine, "integrator_3": np.array([np.nan, 0.0])}, ValueError, "'integrator_3' isn't finite"),
@@ -223,6 +225,8 @@ def test_shields_are_checked():
     """In words that name the setting, before there is a folder."""
     with pytest.raises(ValueError, match=r"margin must be 'certified', 'none' or a number of metres.*'safe'"):
         dataclasses.replace(TINY, shield="safe")
+    with pytest.raises(ValueError, match="dead_reckoning=True is for a filter with a policy"):
+        dataclasses.replace(TINY, shield="none,dead_reckoning=true")
     assert dataclasses.replace(TINY, shield=0.3).shield == "0.3"
     with pytest.raises(ValueError, match="the disturbance pushes 'unicycle_0' aside"):
         training_environment(
