@@ -139,6 +139,7 @@ class ObserverNode:
         self._newest: dict[int, float] = {}
         self._early: dict[int, Message] = {}
         self._heard: dict[int, FloatArray] = {}
+        self._passed_on: dict[int, FloatArray] = {}  # the same at the end of the last round, as the simulator sends it
 
     def __repr__(self) -> str:
         return f"ObserverNode({self.id!r}, {self._estimator}; hears {len(self.hears)}, {len(self.targets)} targets)"
@@ -208,7 +209,7 @@ class ObserverNode:
             self._g.copy() if ppso and self._agent in self._design.inputs.layout.target else None,
             {i: observer.estimate.copy() for i, observer in self._states.items()},
             {i: observer.estimate.copy() for i, observer in self._inputs.items()},
-            {i: g.copy() for i, g in self._heard.items()} if self._design.relay else {},
+            {i: g.copy() for i, g in self._passed_on.items()} if self._design.relay else {},
             self._dtype,
         )
 
@@ -310,6 +311,7 @@ class ObserverNode:
         for observers in (self._states, self._inputs):
             for observer in observers.values():
                 observer.estimate = observer.solved(self.time, self._period)
+        self._passed_on = dict(self._heard)
         self._open = False
 
     def _moved_estimate(self, i: int, dt: float) -> FloatArray:

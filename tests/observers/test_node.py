@@ -140,7 +140,7 @@ def test_nodes_equal_the_batch(name: str, estimator: str) -> None:
     known = {"disturbance": bound, "center": chosen.initial.center, "radius": chosen.initial.radius}
     rounds = Rounds(design, network, int(memory["channel.key"][0]), estimator=estimator, step=h, sampled=True, **known)
     u = np.zeros(fleet.m)
-    for step in range(31):
+    for step in range(81):  # eight rounds: what came late in one has an effect three rounds later at the earliest
         if step:
             u = simulator.u[0].copy()
             simulator.step(h)
