@@ -155,4 +155,4 @@ def parts_of_step(dt: float, longest: float, reason: str) -> int:
             f"dt = {dt:g} s is too long: {reason} takes {longest:.3g} s at a time, and no step is "
             f"divided into more than {MOST_PARTS} parts; take dt of {MOST_PARTS * longest:.3g} s at most"
         )
-    return max(1, math.ceil(dt / longest))
+    return max(1, math.ceil(dt / longest - 1e-9))  # 0.2 - 0.15 is 0.05, not two parts of it
