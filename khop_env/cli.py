@@ -19,6 +19,7 @@ import typer
 
 from khop_env import __version__
 from khop_env.commands.bench import bench
+from khop_env.commands.deploy import deploy
 from khop_env.commands.evaluate import evaluate
 from khop_env.commands.iss import iss
 from khop_env.commands.network import network
@@ -49,6 +50,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "list": list_scenarios,
     "check": check,
     "run": run,
+    "deploy": deploy,
     "export": export,
     "evaluate": evaluate,
     "train": train,

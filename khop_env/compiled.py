@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 import pickle
 import re
 import sys
@@ -20,7 +21,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+PLAIN = "KHOP_ENV_PLAIN"
+"""Environment variable: if it is set Numba isn't loaded, which takes memory and a part of a second."""
+
 try:
+    if os.environ.get(PLAIN):
+        raise ImportError
     import numba
 except ImportError:  # kernels then run as plain Python: slow, but enough for one robot's observers
     numba = None  # type: ignore[assignment]

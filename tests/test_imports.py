@@ -35,6 +35,7 @@ RANKS = [
     ["khop_env.typed"],
     ["khop_env.testing"],
     ["khop_env.results"],
+    ["khop_env.deploy"],
     ["agents"],
     ["khop_env.terminal"],
     ["khop_env.commands"],

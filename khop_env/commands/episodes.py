@@ -122,7 +122,7 @@ def continuous(
     duration = scenario.duration if duration is None else duration
     dt = steps["--dt"] if steps["--dt"] is not None else EXPLICIT_STEP if explicit else scenario.dt
     number_of_steps(duration, dt)  # refuses too many of them before anything is built
-    law = _law(scenario, controller)
+    law = law_of(scenario, controller)
     made = make_law(law)
     longest, stiffest = scenario.longest_step
     parts_of_step(dt, longest, f"the drift of {scenario.fleet.ids[stiffest]!r}")
@@ -219,7 +219,8 @@ def result_of(played: PolicyRun, recording: Recording) -> dict[str, Any]:
     }
 
 
-def _law(scenario: Scenario, controller: str | None) -> LawChoice:
+def law_of(scenario: Scenario, controller: str | None) -> LawChoice:
+    """The law that is asked for, with its parameters; by default the scenario's."""
     from agents.laws import LAWS
     from khop_env.registry import parameters_from_text
     from khop_env.scenarios import LawChoice

@@ -31,14 +31,19 @@ class PlainLink:
 
     def advance(self, up: bool = True) -> int:
         """Run a round, in which a link that isn't `up` loses the message; returns `newest`."""
-        self.round += 1
-        self._bad = plain_uniform(self.key, self.round, self.number, LOSS) < self._probability_of_loss()
-        if up and not self._bad:
-            self._flying.append((self.round + self._rounds_late(), self.round))
+        arrival = self.send(up)
+        if arrival is not None:
+            self._flying.append((arrival, self.round))
         arrived = [sent for arrival, sent in self._flying if arrival <= self.round]
         self._flying = [(arrival, sent) for arrival, sent in self._flying if arrival > self.round]
         self.newest = max([self.newest, *arrived])
         return self.newest
+
+    def send(self, up: bool = True) -> int | None:
+        """Run a round as `advance` does, for callers that hold messages: the round of arrival; None if it is lost."""
+        self.round += 1
+        self._bad = plain_uniform(self.key, self.round, self.number, LOSS) < self._probability_of_loss()
+        return self.round + self._rounds_late() if up and not self._bad else None
 
     def _probability_of_loss(self) -> float:
         if self.network.burst is None:

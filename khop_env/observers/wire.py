@@ -227,6 +227,16 @@ class Message:
         return _form(design, design.fleet.agent(agent), estimator, dtype).size
 
 
+def header_of(data: bytes) -> tuple[int, int]:
+    """The fingerprint of the fleet and the index of the sender, as a packed message of any fleet says.
+
+    Args:
+        data: what `Message.pack` returned.
+    """
+    _, _, theirs, sender, _ = _HEADER.unpack_from(data)
+    return theirs, sender
+
+
 def rounding(dtype: NumberFormat, largest: FloatArray | float) -> FloatArray:
     """Largest error of rounding numbers up to `largest` in size to `dtype`; of the shape of `largest`."""
     if dtype == "float64":

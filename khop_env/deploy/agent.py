@@ -1,0 +1,372 @@
+"""One agent: its plant, its law, its observers and its messages, round by round; and its process.
+
+    python -m khop_env.deploy.agent           # started by the supervisor, which it talks to in lines of JSON
+
+A round: the plant moves on, the node predicts, what came late is taken in, the message is sent, what is on time is
+taken in, and the law acts on the estimates. This is the order of `ObserverNode`, and of the simulator.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from khop_env.deploy.control import Control, LawControl
+from khop_env.deploy.envelope import OVERHEAD, Opener, seal
+from khop_env.deploy.receiver import Receiver
+from khop_env.deploy.record import Columns, Writer
+from khop_env.deploy.robot import Robot
+from khop_env.deploy.transport import Transport, UdpTransport, ZenohTransport
+from khop_env.network import Network, plain_noise
+from khop_env.objects import load_object
+from khop_env.observers import Estimate, Message, ObserverNode
+from khop_env.own_agents import claim_agents
+from khop_env.scenarios import LawChoice, Scenario
+from khop_env.scenarios.named import scenario as scenario_of
+
+PATIENCE = 30.0  # s that a round in step waits for the others' messages
+_STATUS = 0.4  # s between two reports
+_POLL = 2e-4  # s
+
+
+@dataclass(frozen=True)
+class Setup:
+    """All that an agent's process has to be told, as JSON has it.
+
+    Attributes:
+        scenario: name of the scenario, as commands take it.
+        agent: index of the agent.
+        network: fields of `Network`.
+        network_key: of its randomness.
+        estimator: "ppso" or "relay".
+        steps: of the plant, in each of which the law acts, per round.
+        last_step: with which the run ends.
+        law: place of a function that makes a law of a `LawChoice`, "agents.laws:make_law".
+        law_name: which law.
+        law_parameters: its parameters.
+        x: the agent's state, at `first_step`.
+        first_step: step that `x` is of. Until its process begins its input is 0.
+        drawn: random numbers of the disturbance.
+        offset: of this agent's clock, in s, at most `skew`.
+        skew: bound on the difference of any two clocks, in s.
+        run: 4 bytes in hexadecimal digits.
+        key: secret of the run, likewise.
+        folder: of the records.
+        start: number of processes that the agent has had before.
+        transport: "udp" or "zenoh".
+        port: to bind; 0 for a free one.
+    """
+
+    scenario: str
+    agent: int
+    network: Mapping[str, Any]
+    network_key: int
+    estimator: Any
+    steps: int
+    last_step: int
+    law: str
+    law_name: str
+    law_parameters: Mapping[str, Any]
+    x: list[float]
+    drawn: list[float]
+    run: str
+    key: str
+    folder: str
+    first_step: int = 0
+    offset: float = 0.0
+    skew: float = 0.0
+    start: int = 0
+    transport: str = "udp"
+    port: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return asdict(self)
+
+
+class Agent:
+    """An agent that runs when it is told to.
+
+    Args:
+        setup: what it has to know.
+        scenario: the scenario that `setup` names.
+        control: its law.
+        transport: for its messages.
+
+    Attributes:
+        round: the last one, by this agent's clock; -1 before the first.
+        sent: number of messages sent, one per receiver.
+        estimates: what it knows, since the last step.
+        receiver: its messages.
+        robot: its plant.
+    """
+
+    def __init__(self, setup: Setup, scenario: Scenario, control: Control, transport: Transport) -> None:
+        design, agent = scenario.design, setup.agent
+        self.setup, self._control, self.transport = setup, control, transport
+        self.network = network_of(setup)
+        fleet, period = design.fleet, self.network.period
+        h, attached = period / setup.steps, None if scenario.disturbance is None else scenario.disturbance.attach(fleet)
+        assumed: dict[str, Any] = {
+            "center": scenario.initial.center,
+            "radius": scenario.initial.radius,
+            "disturbance": 0.0 if attached is None else attached.bound,
+            "noise": self.network.noise,
+        }
+        exact = setup.skew > 0.0
+        self.robot = Robot(
+            fleet, agent, h, np.array(setup.x), scenario.disturbance, np.array(setup.drawn, float), exact
+        )
+        self.robot.step = setup.first_step
+        self.node = ObserverNode(
+            design,
+            agent,
+            estimator=setup.estimator,
+            period=period,
+            step=h,
+            skew=setup.skew,
+            sampled=not exact,
+            **assumed,
+        )
+        run, key = bytes.fromhex(setup.run), bytes.fromhex(setup.key)
+        sizes = {p: Message.size(design, p, setup.estimator, "float64") for p in design.links.senders[agent]}
+        ahead = 2 + math.ceil(setup.skew / period)
+        self.receiver = Receiver(
+            design, agent, self.network, setup.network_key, Opener(design, sizes, run, key, period, ahead)
+        )
+        self._run, self._key = run, key
+        self._to = [a for p, a in design.links.index if p == agent]
+        self._rows = range(fleet.n)[fleet.state_slice(agent)]
+        self.writer = Writer(Path(setup.folder), fleet, Columns.of(design, agent), agent, setup.start)
+        self.message_size = Message.size(design, agent, setup.estimator, "float64") + OVERHEAD
+        self.round, self.sent = -1, 0
+        self.estimates: dict[str, Estimate] = {}
+
+    def catch_up(self, step: int) -> None:
+        """Let the plant move on to a step under the input in force, and take no part: after a start, or a stop."""
+        while self.robot.step < step:
+            self._move()
+
+    def begin(self, in_step: bool = False, first: bool = False) -> None:
+        """The first half of a step: the plant moves, and if a round is due the message is sent.
+
+        Args:
+            in_step: whether all other agents are in this step, too.
+            first: of this process: the plant stays where it is.
+        """
+        robot = self.robot
+        if first:
+            self.writer.state(robot.step, robot.x, robot.u)
+            self.receiver.opener.start(self._local_round())
+        else:
+            self._move()
+        x = robot.x
+        if self.network.noise:
+            number = -(-robot.step // self.setup.steps)  # of the round that is due now or next
+            x = x + [plain_noise(self.network, self.setup.network_key, number, row) for row in self._rows]
+        self.node.update(self._local_time(), x, robot.u)
+        if not self._due():
+            return
+        self.round = self._local_round()
+        self._take(self.receiver.late(self.round, in_step) if in_step else self._drained(late=True))
+        sealed = seal(self.node.message().pack(), self._run, self._key)
+        for to in self._to:
+            self.transport.send(sealed, to)
+        self.sent += len(self._to)
+
+    def end(self, in_step: bool = False) -> None:
+        """The second half: what is on time is taken in, and the law acts.
+
+        Raises:
+            TimeoutError: in step, if a message doesn't come.
+        """
+        robot = self.robot
+        if self._due():
+            if in_step:
+                self._wait()
+            self._take(self.receiver.on_time(self.round) if in_step else self._drained(late=False))
+        self.estimates = self.node.estimates(self._local_time())
+        robot.hold(self._control(robot.t, robot.x, self.estimates))
+
+    def write(self, timing: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        """Put on record what is known now; `timing` is of the round."""
+        self.writer.knowledge(self.robot.step, timing, self.robot.u, self.receiver.newest, self.estimates)
+
+    def counts(self) -> dict[str, Any]:
+        """What became of messages so far."""
+        receiver = self.receiver
+        return {
+            "sent": self.sent,
+            "received": receiver.received,
+            "lost": receiver.lost,
+            "refused": dict(receiver.opener.refused),
+            "message_bytes": self.message_size,
+        }
+
+    def _due(self) -> bool:
+        return self.robot.step % self.setup.steps == 0
+
+    def _local_time(self) -> float:
+        """Time in s by this agent's clock."""
+        return self.robot.t + self.setup.offset
+
+    def _local_round(self) -> int:
+        return math.floor(self._local_time() / self.network.period + 1e-6)
+
+    def _move(self) -> None:
+        self.robot.advance()
+        self.writer.state(self.robot.step, self.robot.x, self.robot.u)
+
+    def _drained(self, late: bool) -> list[Message]:
+        self.receiver.take(self.transport.receive(), self.round)
+        return self.receiver.late(self.round, False) if late else self.receiver.on_time(self.round)
+
+    def _wait(self) -> None:
+        until = time.monotonic() + PATIENCE
+        self.receiver.take(self.transport.receive(), self.round)
+        while not self.receiver.complete(self.round):
+            if time.monotonic() > until:
+                raise TimeoutError(
+                    f"{self.node.id}: no message of round {self.round} from agents {self.receiver.missing(self.round)} "
+                    f"within {PATIENCE:g} s; is UDP on 127.0.0.1 filtered?"
+                )
+            time.sleep(_POLL)
+            self.receiver.take(self.transport.receive(), self.round)
+
+    def _take(self, messages: list[Message]) -> None:
+        for message in messages:
+            try:
+                self.node.receive(message)
+            except ValueError:
+                self.receiver.opener.refused["refused by the node"] += 1
+
+
+def network_of(setup: Setup) -> Network:
+    """The network of a setup."""
+    found = Network.of({name: tuple(each) if isinstance(each, list) else each for name, each in setup.network.items()})
+    assert found is not None
+    return found
+
+
+def transport_of(setup: Setup) -> UdpTransport | ZenohTransport:
+    """The transport of a setup, which still has to meet the others."""
+    if setup.transport == "zenoh":
+        return ZenohTransport(setup.agent, setup.run, setup.port)
+    return UdpTransport(setup.port)
+
+
+def control_of(setup: Setup, scenario: Scenario) -> Control:
+    """The law of a setup."""
+    law = load_object(setup.law)(LawChoice(setup.law_name, setup.law_parameters))
+    return LawControl(law, scenario.fleet, setup.agent, scenario.task)
+
+
+# -- the process ---------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Run one agent, as the lines on stdin say; ends as soon as stdin does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor ends its agents, by closing their stdin
+    claim_agents()
+    try:
+        _run()
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        say(sys.stdout, error=str(error))
+        sys.exit(2)
+
+
+def _run() -> None:
+    setup = Setup(**json.loads(sys.stdin.readline()))
+    scenario = scenario_of(setup.scenario)
+    transport = transport_of(setup)
+    agent = Agent(setup, scenario, control_of(setup, scenario), transport)
+    say(sys.stdout, ready=transport.port)
+    order = json.loads(sys.stdin.readline() or "null")
+    if order is None:
+        return
+    transport.meet({int(number): port for number, port in order["ports"].items()})
+    if "begin" in order:
+        threading.Thread(target=_end_with_stdin, daemon=True).start()
+        in_time(agent, order["begin"])
+    else:
+        say(sys.stdout, met=True)
+        in_step(agent)
+    say(sys.stdout, ended=agent.counts())
+    agent.writer.close()
+    transport.close()
+
+
+def in_step(agent: Agent) -> None:
+    """Rounds as the supervisor calls them, one for each line on stdin."""
+    steps, first = agent.setup.steps, True
+    for _ in sys.stdin:
+        began = time.process_time()
+        for _ in range(1 if first else steps):
+            agent.begin(in_step=True, first=first)
+            agent.end(in_step=True)
+            agent.write((0.0, 0.0, time.process_time() - began))
+            first = False
+        say(sys.stdout, done=agent.round, **agent.counts())
+        if agent.robot.step >= agent.setup.last_step:
+            return
+
+
+def in_time(agent: Agent, begin: float) -> None:
+    """Rounds at multiples of the period, by the system's monotonic clock.
+
+    Args:
+        agent: runs them.
+        begin: time 0 of the run, by that clock.
+    """
+    setup, period = agent.setup, agent.network.period
+    last = setup.last_step // setup.steps
+    first, reported, cpu = True, 0.0, time.process_time()
+    number = 0 if setup.first_step == 0 else setup.first_step // setup.steps + 1
+    while number <= last:
+        ahead = begin + number * period - time.monotonic()
+        if ahead > 0.0:
+            time.sleep(ahead)
+        now = time.monotonic() - begin
+        number = min(last, max(number, math.floor(now / period)))  # rounds that were missed stay missed
+        step = number * setup.steps
+        agent.catch_up(step if first else step - setup.steps)
+        while first or agent.robot.step < step:
+            agent.begin(first=first)
+            agent.end()
+            first = False
+            if agent.robot.step < step:
+                agent.write()
+        due, used = number * period, time.process_time()
+        agent.write((now - due, time.monotonic() - begin - due, used - cpu))
+        cpu, number = used, number + 1
+        if now - reported > _STATUS:
+            reported = now
+            say(sys.stdout, status=agent.counts())
+
+
+def say(stream: TextIO, **what: Any) -> None:
+    """A line for the supervisor."""
+    stream.write(json.dumps(what) + "\n")
+    stream.flush()
+
+
+def _end_with_stdin() -> None:
+    """End this process with its stdin, which the system closes if the supervisor is killed."""
+    while os.read(0, 1024):
+        pass
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()
