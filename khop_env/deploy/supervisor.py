@@ -107,17 +107,20 @@ class Process:
                 self.error = said[-1] if said else f"ended with status {self.popen.returncode}"
             self.ended = True
 
-    def kill(self) -> None:
-        """SIGKILL, and wait until it is gone."""
-        self.ended = True
-        self.popen.kill()
-        self.popen.wait()
-
     def close(self) -> None:
         """End its stdin, upon which it ends."""
         assert self.popen.stdin is not None
         with suppress(OSError):
             self.popen.stdin.close()
+
+    def kill(self) -> None:
+        """SIGKILL, and wait until it is gone."""
+        assert self.popen.stdout is not None
+        self.ended = True
+        self.close()
+        self.popen.kill()
+        self.popen.wait()
+        self.popen.stdout.close()
 
 
 class Supervisor:
@@ -296,9 +299,5 @@ class Supervisor:
         for process in self.processes:
             with suppress(subprocess.TimeoutExpired):
                 process.popen.wait(max(0.0, until - time.monotonic()))
-            if process.popen.poll() is None:
-                process.popen.kill()
-                process.popen.wait()
-            assert process.popen.stdout is not None
-            process.popen.stdout.close()
+            process.kill()
         self._selector.close()

@@ -116,6 +116,7 @@ class Team:
     def kill(self, a: int) -> None:
         """As SIGKILL does."""
         agent = self.agents[a]
+        agent.writer.close()
         agent.transport.close()
         self.agents[a] = None
         self.killed[a].append((self.step + 1) * agent.robot.h)
