@@ -17,7 +17,6 @@ refused with a ValueError and leaves the node as it was. Nothing here needs a si
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -108,6 +107,7 @@ class ObserverNode:
         self._design, self._agent, self._estimator = design, fleet.agent(agent), estimator
         self._period, self._step, self._skew, self._dtype = period, step, skew, dtype
         self._largest = _of_fleet(design, "largest", math.inf if largest is None else largest)
+        self._unlimited = bool(np.isinf(self._largest).all())
         values = {
             "disturbance": _of_fleet(design, "disturbance", disturbance),
             "noise": _of_fleet(design, "noise", noise),
@@ -165,7 +165,7 @@ class ObserverNode:
         moved = [target.moved(target.freshest.state, self.time, dt) for target in self._targets.values()]
         estimates = {i: self._moved_estimate(i, dt) for i in self._states}
         for target, state in zip(self._targets.values(), moved, strict=True):
-            target.freshest = replace(target.freshest, state=state)
+            target.freshest = target.freshest._replace(state=state)
         for i, estimate in estimates.items():
             self._states[i].estimate = estimate
         self.time, self._x, self._g = float(t), x, g
@@ -188,7 +188,7 @@ class ObserverNode:
         """
         if self._updates == 0:
             raise ValueError(f"node of {self.id!r}: no message before the first update(t, own_state, own_input)")
-        if (np.abs(self._x) > self._limit(self._agent)).any():
+        if not self._within(self._agent, self._x):
             raise ValueError(
                 f"node of {self.id!r}: its state {self._x.tolist()} is beyond largest = "
                 f"{self._limit(self._agent).tolist()}, up to which the rounding to {self._dtype} is certified"
@@ -196,7 +196,7 @@ class ObserverNode:
         known = {
             i: Known(held.stamp, held.hops, held.state.copy())
             for i, held in ((i, target.freshest) for i, target in self._targets.items())
-            if 1 <= held.hops <= 255 and (np.abs(held.state) <= self._limit(i)).all()
+            if 1 <= held.hops <= 255 and self._within(i, held.state)
         }
         ppso = self._estimator == "ppso"
         return Message(
@@ -241,7 +241,7 @@ class ObserverNode:
                 f"give all nodes dtype={message.dtype!r} and `largest`"
             )
         for i, state in [(sender, message.state), *((i, known.state) for i, known in message.known.items())]:
-            if (np.abs(state) > self._limit(i) * (1.0 + 1e-3)).any():
+            if not self._within(i, state, 1.0 + 1e-3):
                 raise ValueError(f"{who}: {ids[sender]!r} sent a state of {ids[i]!r} beyond largest, {state.tolist()}")
         ahead = message.time - self.time
         if ahead > self._period + self._skew:
@@ -284,7 +284,7 @@ class ObserverNode:
         for i, (state, stamp, hops) in sent.items():
             received = Received(state, stamp, hops, (self._updates, dt > 0.0), sender)
             if i in self._targets and received.replaces(self._targets[i].freshest):
-                fresh[i] = replace(received, state=self._targets[i].moved(state, message.time, dt))
+                fresh[i] = received._replace(state=self._targets[i].moved(state, message.time, dt))
         for i, received in fresh.items():
             self._targets[i].freshest = received
         self._newest[sender] = message.time
@@ -327,6 +327,9 @@ class ObserverNode:
 
     def _limit(self, i: int) -> FloatArray:
         return self._largest[self._design.fleet.state_slice(i)]
+
+    def _within(self, i: int, state: FloatArray, margin: float = 1.0) -> bool:
+        return self._unlimited or bool((np.abs(state) <= self._limit(i) * margin).all())
 
     def _since(self, t: float, what: str) -> float:
         if not (math.isfinite(number(t, f"node of {self.id!r}: the time of {what}")) and t >= self.time):

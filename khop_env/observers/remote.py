@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -37,8 +36,7 @@ class Estimate(NamedTuple):
     age: float
 
 
-@dataclass(frozen=True)
-class Received:
+class Received(NamedTuple):
     """A state of an agent that has come in a message, predicted for now.
 
     Attributes:
@@ -101,6 +99,7 @@ class RemoteAgent:
         region = model.operating_region(np.abs(center) + radius, disturbance)
         self._known = _certificate(model, *(_frozen(values) for values in (disturbance, noise, region)))
         self._initial = _certificate(model, *(_frozen(values) for values in (disturbance, radius, region)))
+        self._bounded = bool(np.isfinite(region).any())
         growth = self._growth = self._known.growth
         # in a sampled system, radii after 0, 1, ... steps: of the initial set, and of what has arrived
         self._in_steps = [[radius], [noise]] if sampled else None
@@ -158,9 +157,11 @@ class RemoteAgent:
         state = self.moved(known.state, t - dt, dt)
         box = self._box(state, t)
         if proposal is None:
-            low, high = box  # without a finite region the prediction is the centre; so it is where nothing is certain
-            with np.errstate(invalid="ignore"):
-                proposal = np.where(np.isfinite(self._known.region), 0.5 * (low + high), state)
+            proposal = state  # the centre, without a finite region; so it is where nothing is certain
+            if self._bounded:
+                low, high = box
+                with np.errstate(invalid="ignore"):
+                    proposal = np.where(np.isfinite(self._known.region), 0.5 * (low + high), state)
         estimate = box.clip(proposal)
         # an empty box proves that some assumption doesn't hold: then nothing is certain
         bound = np.full(len(state), math.inf) if box.empty() else box.far_face(estimate)
@@ -179,7 +180,8 @@ class RemoteAgent:
             radius = certificate.radius(np.array(age))
         if self._rounding is not None:
             radius = radius + hops * self._rounding.at(np.array(age + self._skew))
-        return Box.around(state, radius).intersect(Box(-certificate.region, certificate.region))
+        box = Box.around(state, radius)
+        return box.intersect(Box(-certificate.region, certificate.region)) if self._bounded else box
 
     def _sampled_radius(self, kept: list[FloatArray], age: float) -> FloatArray:
         """The radius of r+ = r + h (min(Lambda r, spread) + g_bar + w_bar); `kept` are those after 0, 1, ... steps."""

@@ -17,6 +17,7 @@ A message of one agent always has one size. All is little-endian.
 from __future__ import annotations
 
 import functools
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Mapping
@@ -305,7 +306,7 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
 def _check(design: ObserverDesign, who: str, what: str, values: Mapping[int, FloatArray | None]) -> None:
     for i, value in values.items():
         found, n = np.asarray(value, np.float64), design.fleet.models[i].n
-        if found.shape != (n,) or not np.isfinite(found).all():
+        if found.shape != (n,) or not all(map(math.isfinite, found.tolist())):  # quicker than NumPy's for few numbers
             raise ValueError(
                 f"{who}: {what} of {design.fleet.ids[i]!r} must be {n} finite numbers; got {found.tolist()}"
             )
