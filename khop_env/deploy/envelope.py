@@ -139,6 +139,8 @@ class Opener:
             message = Message.unpack(payload, self._design)
         except ValueError:
             raise RefusedError("not finite") from None
+        if message.time < 0.0:
+            raise RefusedError("not finite")
         number = math.floor(message.time / self._period + 1e-6)
         if number > now + self._ahead:
             raise RefusedError("of the future")
