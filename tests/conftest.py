@@ -43,6 +43,8 @@ SLOW = tuple(
         "env/test_sb3.py::test_ppo",
         # processes, one or more per test
         "agents/test_workers.py",
+        "deploy/test_lockstep.py::test_processes",
+        "deploy/test_processes.py",
         "env/test_concurrency.py",
         "agents/test_evaluation.py::test_the_same_numbers",
         "benchmarks/test_benchmark.py::test_ctrl_c",

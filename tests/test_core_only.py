@@ -17,6 +17,7 @@ SHORTER = {  # what makes a command take seconds; the code that it runs is the s
     "khop run paper --integrator explicit": "--duration 0.0005",
     "khop evaluate": "--episodes 2",
     "khop tune": "--policies tanh --observe estimate",
+    "khop deploy": "--duration 1",
     "khop network": "--networks wifi --episodes 1 --duration 1",
     "khop iss": "--episodes 1 --duration 0.5",
     "khop test": "--steps 20",
@@ -57,7 +58,8 @@ def core(tmp_path_factory):
 
 def test_the_readme_names_every_command():
     named = {one.split()[1] for one in commands()}
-    assert named == {"list", "check", "run", "export", "evaluate", "train", "tune", "iss", "network", "test", "bench"}
+    rest = {"evaluate", "train", "tune", "iss", "network", "deploy", "test", "bench"}
+    assert named == {"list", "check", "run", "export", *rest}
 
 
 def test_extras_cannot_be_imported_here(core):

@@ -187,8 +187,7 @@ def collected_of(
         wall_time=supervisor.wall_time,
         error=StoppedError("; ".join(errors)) if errors else None,
     )
-    counts = [process.counts for process in supervisor.processes] or [{} for _ in setups]
-    return collected, measured(collected, counts, fleet.ids, over.network.period, lockstep)
+    return collected, measured(collected, supervisor.counts(), fleet.ids, over.network.period, lockstep)
 
 
 @contextmanager

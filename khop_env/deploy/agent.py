@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -106,6 +106,7 @@ class Agent:
 
     Attributes:
         round: the last one, by this agent's clock; -1 before the first.
+        clock: the round that it is now, which is later if this process is.
         sent: number of messages sent, one per receiver.
         estimates: what it knows, since the last step.
         receiver: its messages.
@@ -151,6 +152,9 @@ class Agent:
         self.writer = Writer(Path(setup.folder), fleet, Columns.of(design, agent), agent, setup.start)
         self.message_size = Message.size(design, agent, setup.estimator, "float64") + OVERHEAD
         self.round, self.sent = -1, 0
+        self.clock: Callable[[], int] = lambda: self.round
+        if setup.start == 0:
+            self.writer.state(self.robot.step, self.robot.x, self.robot.u)
         self.estimates: dict[str, Estimate] = {}
 
     def catch_up(self, step: int) -> None:
@@ -167,7 +171,6 @@ class Agent:
         """
         robot = self.robot
         if first:
-            self.writer.state(robot.step, robot.x, robot.u)
             self.receiver.opener.start(self._local_round())
         else:
             self._move()
@@ -229,7 +232,7 @@ class Agent:
         self.writer.state(self.robot.step, self.robot.x, self.robot.u)
 
     def _drained(self, late: bool) -> list[Message]:
-        self.receiver.take(self.transport.receive(), self.round)
+        self.receiver.take(self.transport.receive(), self.clock())
         return self.receiver.late(self.round, False) if late else self.receiver.on_time(self.round)
 
     def _wait(self) -> None:
@@ -332,6 +335,7 @@ def in_time(agent: Agent, begin: float) -> None:
     setup, period = agent.setup, agent.network.period
     last = setup.last_step // setup.steps
     first, reported, cpu = True, 0.0, time.process_time()
+    agent.clock = lambda: math.floor((time.monotonic() - begin + setup.offset) / period)
     number = 0 if setup.first_step == 0 else setup.first_step // setup.steps + 1
     while number <= last:
         ahead = begin + number * period - time.monotonic()

@@ -12,13 +12,14 @@ import selectors
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import khop_env
+from khop_env import deploy
 from khop_env.compiled import PLAIN
 from khop_env.deploy.agent import Setup
 from khop_env.deploy.record import Columns, rows_of
@@ -64,7 +65,7 @@ class Process:
         self.setup, self.port, self.counts, self.ended, self.error = setup, 0, {}, False, ""
         self.round = -1
         self._errors = folder / f"{name}.{setup.start}.stderr"
-        root = str(Path(khop_env.__file__).parents[1])
+        root = str(Path(deploy.__file__).parents[2])
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         with open(self._errors, "wb") as errors:
@@ -163,7 +164,7 @@ class Supervisor:
         self.killed: list[list[float]] = [[] for _ in setups]
         self.interrupted, self.wall_time = False, 0.0
         self._selector = selectors.DefaultSelector()
-        self._begin = 0.0
+        self._begin, self._gone = 0.0, list[Process]()
 
     def run(self) -> None:
         """Start, run and end all processes; what is on record stays, however it ends."""
@@ -184,6 +185,19 @@ class Supervisor:
     def now(self) -> float:
         """Seconds since time 0 of the run."""
         return time.monotonic() - self._begin
+
+    def counts(self) -> list[dict[str, Any]]:
+        """What became of each agent's messages, of all its processes until they said so last."""
+        found = []
+        for agent in range(len(self._setups)):
+            said = [each.counts for each in [*self._gone, *self.processes] if each.setup.agent == agent and each.counts]
+            whole: dict[str, Any] = {"refused": Counter()}
+            for counts in said:
+                whole |= {name: whole.get(name, 0) + counts[name] for name in ("sent", "received", "lost")}
+                whole["refused"] += Counter(counts["refused"])
+                whole["message_bytes"] = counts["message_bytes"]
+            found.append(whole | {"refused": dict(whole["refused"])})
+        return found
 
     # -- parts ---------------------------------------------------------------------------------------------------
 
@@ -252,6 +266,7 @@ class Supervisor:
         setup = replace(old.setup, start=old.setup.start + 1, port=old.port)
         if len(rows):
             setup = replace(setup, first_step=int(rows[-1, 0]), x=rows[-1, 1 : 1 + columns.n].tolist())
+        self._gone.append(old)
         self.processes[agent] = self._launched(setup)
 
     def _listen(self, wait: float, late: str | None) -> None:

@@ -240,7 +240,8 @@ class ObserverNode:
                 f"{who}: {ids[sender]!r} sent {message.dtype}, but this node's bounds allow for {self._dtype}; "
                 f"give all nodes dtype={message.dtype!r} and `largest`"
             )
-        for i, state in [(sender, message.state), *((i, known.state) for i, known in message.known.items())]:
+        states = [] if self._unlimited else [(i, known.state) for i, known in message.known.items()]
+        for i, state in [(sender, message.state), *states]:
             if not self._within(i, state, 1.0 + 1e-3):
                 raise ValueError(f"{who}: {ids[sender]!r} sent a state of {ids[i]!r} beyond largest, {state.tolist()}")
         ahead = message.time - self.time
