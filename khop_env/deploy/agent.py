@@ -8,6 +8,7 @@ taken in, and the law acts on the estimates. This is the order of `ObserverNode`
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -294,6 +295,7 @@ def _run() -> None:
     scenario = scenario_of(setup.scenario)
     transport = transport_of(setup)
     agent = Agent(setup, scenario, control_of(setup, scenario), transport)
+    gc.freeze()  # what is there now stays: collecting it again and again takes tens of milliseconds
     say(sys.stdout, ready=transport.port)
     order = json.loads(sys.stdin.readline() or "null")
     if order is None:

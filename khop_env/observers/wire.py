@@ -21,7 +21,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -211,19 +211,17 @@ class Message:
                 values = numbers[place + 2 : place + 2 + n]
                 known[i] = Known(stamp if dtype == "float64" else time - stamp, hops, values)
             place += 2 + n
-        return Message(
-            design,
-            sender,
-            time,
-            state,
-            known,
-            form.estimator,
-            take(own)[sender] if form.input_effect else None,
-            take(form.estimates),
-            take(form.input_estimates),
-            {i: values for i, values in take(form.heard).items() if not np.isnan(values).all()},
-            dtype,
-        )
+        effect = take(own)[sender] if form.input_effect else None
+        estimates, input_estimates = take(form.estimates), take(form.input_estimates)
+        certain = place  # what comes before is never NaN
+        heard = {i: values for i, values in take(form.heard).items() if not np.isnan(values).all()}
+        found = design, sender, time, state, known, form.estimator, effect, estimates, input_estimates, heard, dtype
+        right = all(map(math.isfinite, [time, *rest[:certain], *np.concatenate([_NOTHING, *heard.values()]).tolist()]))
+        if not right or any(each.stamp > time for each in known.values()):
+            return Message(*found)  # which says what is wrong
+        message = object.__new__(Message)  # shapes and agents are right by construction: not checked once more
+        message.__dict__.update(zip(_FIELDS, found, strict=True))
+        return message
 
     @staticmethod
     def size(
@@ -238,6 +236,10 @@ class Message:
             dtype: format of the numbers.
         """
         return _form(design, design.fleet.agent(agent), estimator, dtype).size
+
+
+_FIELDS = tuple(each.name for each in fields(Message))
+_NOTHING = np.zeros(0)
 
 
 def header_of(data: bytes) -> tuple[int, int]:
