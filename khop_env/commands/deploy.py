@@ -27,6 +27,7 @@ from khop_env.commands.deploying import (
     live_table,
     over_network,
     print_deployed,
+    run_all,
     setups_of,
     simulated_part,
     steps_per_round,
@@ -127,7 +128,7 @@ def deploy(
     with live_table(chosen, records, period) as watch:
         supervisor = Supervisor(chosen, setups, in_step=lockstep, kills=kills, watch=watch)
         with mistakes():
-            supervisor.run()
+            run_all(supervisor)
     with mistakes(), waiting(f"writing {folder}"):
         collected, found = collected_of(supervisor, chosen, over, setups, lockstep)
         recording = collected.recording

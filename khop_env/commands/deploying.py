@@ -156,6 +156,21 @@ def setups_of(
     ]
 
 
+def run_all(supervisor: Supervisor) -> None:
+    """Run all processes; an error after their first round is one of the run, whose results up to then are kept.
+
+    Raises:
+        OSError: if nothing is on record.
+    """
+    try:
+        supervisor.run()
+    except OSError as error:
+        if not any(path.stat().st_size for path in supervisor.folder.glob("*.known")):
+            raise
+        if str(error) not in supervisor.errors:
+            supervisor.errors.append(str(error))
+
+
 def collected_of(
     supervisor: Supervisor, scenario: Scenario, over: Networked, setups: Sequence[Setup], lockstep: bool
 ) -> tuple[Collected, dict[str, Any]]:

@@ -242,8 +242,8 @@ class Agent:
         while not self.receiver.complete(self.round):
             if time.monotonic() > until:
                 raise TimeoutError(
-                    f"{self.node.id}: no message of round {self.round} from agents {self.receiver.missing(self.round)} "
-                    f"within {PATIENCE:g} s; is UDP on 127.0.0.1 filtered?"
+                    f"no message of round {self.round} from agents {self.receiver.missing(self.round)} within "
+                    f"{PATIENCE:g} s; are datagrams on 127.0.0.1 filtered?"
                 )
             time.sleep(_POLL)
             self.receiver.take(self.transport.receive(), self.round)
@@ -305,7 +305,8 @@ def _run() -> None:
         threading.Thread(target=_end_with_stdin, daemon=True).start()
         in_time(agent, order["begin"])
     else:
-        say(sys.stdout, met=True)
+        if isinstance(transport, ZenohTransport):
+            transport.wait()
         in_step(agent)
     say(sys.stdout, ended=agent.counts())
     agent.writer.close()

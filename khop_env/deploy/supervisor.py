@@ -292,7 +292,7 @@ class Supervisor:
         elif "done" in line:
             process.round, process.counts = line.pop("done"), line
         elif "error" in line:
-            process.error = line["error"]
+            process.error, process.ended = line["error"], True
         process.counts = line.get("status") or line.get("ended") or process.counts
         if "ended" in line:
             process.ended = True

@@ -10,6 +10,7 @@ import contextlib
 import errno
 import json
 import socket
+import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -19,6 +20,7 @@ from khop_env.extras import how_to_install
 LOCAL = "127.0.0.1"
 _LARGEST = 65_507  # bytes of a UDP datagram
 _MOST = 4096  # datagrams that are read at once, so that a flood doesn't hold up a round
+_CONNECTING = 10.0  # s
 _BUFFER = 1 << 20  # bytes; the system may allow less
 
 Datagram = tuple[bytes, int | None]
@@ -141,7 +143,10 @@ class ZenohTransport:
         self._session: Any = None
 
     def meet(self, ports: Mapping[int, int]) -> None:
-        """Listen, and connect to the other agents, which listen at these ports, by their indices."""
+        """Listen, and connect to the other agents, which listen at these ports, by their indices.
+
+        That takes a moment, in which what is sent is lost; `wait` until it is over.
+        """
         config = self._zenoh.Config()
         config.insert_json5("mode", '"peer"')
         config.insert_json5("listen/endpoints", json.dumps([f"tcp/{LOCAL}:{self.port}"]))
@@ -151,7 +156,20 @@ class ZenohTransport:
         config.insert_json5("scouting/gossip/enabled", "false")
         self._session = self._zenoh.open(config)
         self._subscriber = self._session.declare_subscriber(f"khop/{self._run}/{self._agent}/*", self._take)
-        self._publishers: dict[int, Any] = {}
+        names = {agent: f"khop/{self._run}/{agent}/{self._agent}" for agent in ports if agent != self._agent}
+        self._publishers = {agent: self._session.declare_publisher(name) for agent, name in names.items()}
+
+    def wait(self) -> None:
+        """Wait until all others are connected.
+
+        Raises:
+            TimeoutError: after ten seconds; the message has their numbers.
+        """
+        until = time.monotonic() + _CONNECTING
+        while absent := [agent for agent, each in self._publishers.items() if not each.matching_status.matching]:
+            if time.monotonic() > until:
+                raise TimeoutError(f"agent {self._agent}: no connection to agents {absent} within {_CONNECTING:g} s")
+            time.sleep(0.01)
 
     def _take(self, sample: Any) -> None:
         name = str(sample.key_expr).rpartition("/")[2]
@@ -159,8 +177,6 @@ class ZenohTransport:
 
     def send(self, data: bytes, to: int) -> None:
         """Put a datagram under the receiver's key."""
-        if to not in self._publishers:
-            self._publishers[to] = self._session.declare_publisher(f"khop/{self._run}/{to}/{self._agent}")
         self._publishers[to].put(data)
 
     def receive(self) -> list[Datagram]:

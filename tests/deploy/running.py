@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import networkx as nx
 import numpy as np
+import pytest
 
 from agents import make_law
 from khop_env.commands.deploying import setups_of, simulated_part
@@ -27,6 +29,8 @@ from khop_env.physics import (
 )
 from khop_env.scenarios import LawChoice, Scenario
 from khop_env.simulation import Simulator
+
+NO_ZENOH = pytest.mark.skipif(importlib.util.find_spec("zenoh") is None, reason="eclipse-zenoh isn't installed")
 
 LAW = LawChoice("linear", {"gain": 1.5})
 

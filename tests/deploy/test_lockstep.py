@@ -8,7 +8,7 @@ import pytest
 
 from khop_env.network import Network
 from khop_env.observers.networked import missed_rounds
-from tests.deploy.running import Team, scenario_of, simulator_of
+from tests.deploy.running import NO_ZENOH, Team, scenario_of, simulator_of
 from tests.test_cli import khop, refused
 
 
@@ -57,12 +57,14 @@ def test_lockstep_equals_the_simulator(seed, estimator, tmp_path):
     assert 0 < sum(count["lost"] for count in counts) < rounds * links
 
 
-def test_processes_in_lockstep_equal_khop_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("transport", ["udp", pytest.param("zenoh", marks=NO_ZENOH)])
+def test_processes_in_lockstep_equal_khop_run(transport, tmp_path, monkeypatch):
     """The command against the command, each agent a real process."""
     monkeypatch.chdir(tmp_path)
     name = "random_geometric:agents=4,k=2"
     options = ("--duration", "0.8", "--network", "lossy:loss=0.3,burst=3", "--dt", "0.05")
-    deployed = json.loads(khop("deploy", name, "--lockstep", *options, "--json", "--out", "a").stdout)
+    how = ("--lockstep", "--transport", transport, "--json", "--out", "a")
+    deployed = json.loads(khop("deploy", name, *how, *options).stdout)
     khop("run", name, *options, "--out", "b")
     for table in ("states", "estimates"):
         found, wanted = (pl.read_parquet(tmp_path / folder / f"{table}.parquet") for folder in "ab")
