@@ -237,7 +237,7 @@ def _table(fraction: float, supervisor: Supervisor, live: Any, scenario: Scenari
         counts, name = process.counts, scenario.fleet.ids[process.setup.agent]
         messages = [str(counts.get(key, 0)) for key in ("sent", "received", "lost")]
         table.add_row(
-            name if process.alive else f"{name} (away)",
+            f"{name} ({process.state})" if process.state else name,
             "" if math.isnan(each.period_kept) else f"{100.0 * each.period_kept:.1f} %",
             *messages,
             str(sum(counts.get("refused", {}).values())),
@@ -264,7 +264,7 @@ def print_deployed(found: Mapping[str, Any], period: float) -> None:
     began = "no round" if late is None else f"{late['median']:.2g} ms late (99 %: {late['p99']:.2g}, {late['max']:.3g})"
     print_text(
         f"{100.0 * found['period_kept']:.4g} % of the rounds ended within their {1e3 * period:g} ms, {found['missed']} "
-        f"were missed; they began {began}; {used}"
+        f"didn't take place; they began {began}; {used}"
     )
     for agent, each in found["agents"].items():
         if each["away_rounds"]:

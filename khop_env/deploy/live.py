@@ -12,7 +12,7 @@ from khop_env.deploy.record import Columns, path_of
 from khop_env.observers import FloatArray
 from khop_env.scenarios import Scenario
 
-_ROWS = 64
+_ROWS, _COMPARED = 64, 8
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,8 @@ class Now:
 
     Attributes:
         period_kept: share of its last rounds that ended within their period; nan for none.
-        ratio: largest error over its certified bound, in its last step that can be compared; nan for none.
+        ratio: largest error over its certified bound, in the last step in which it can be compared with the most true
+            states; nan for none.
         age: of the oldest state that it knows, in s; inf where nothing has arrived of some agent.
     """
 
@@ -59,18 +60,18 @@ class Live:
         ended = rows[rows[:, 2] > 0.0, 2]
         kept = float((ended <= self._period).mean()) if len(ended) else math.nan
         first = 4 + columns.m + len(columns.senders)
-        for row in rows[::-1]:
-            step, at, ratio, age = int(row[0]), first, 0.0, 0.0
-            if any(step not in states[target] for target in columns.targets):
-                continue
+        most, ratio = 0, math.nan
+        for row in rows[::-1][:_COMPARED]:  # others may be a few rounds behind, or away
+            at, found = first, []
             for target, n in columns.targets.items():
-                age = max(age, float(row[at]))
-                error = np.abs(row[at + 1 : at + 1 + n] - states[target][step])
-                bound = row[at + 1 + n : at + 1 + 2 * n]
-                ratio = max(ratio, *np.divide(error, bound, out=np.zeros(n), where=error > 0.0).tolist())
+                if (true := states[target].get(int(row[0]))) is not None:
+                    error, bound = np.abs(row[at + 1 : at + 1 + n] - true), row[at + 1 + n : at + 1 + 2 * n]
+                    found.append(float(np.divide(error, bound, out=np.zeros(n), where=error > 0.0).max()))
                 at += 1 + 2 * n
-            return Now(kept, ratio, age)
-        return Now(kept, math.nan, math.inf)
+            if len(found) > most:
+                most, ratio = len(found), max(found)
+        places = first + np.cumsum([0, *(1 + 2 * n for n in columns.targets.values())])[:-1]
+        return Now(kept, ratio, float(rows[-1, places].max(initial=0.0)))
 
     def _last(self, agent: int, start: int, kind: str, width: int) -> FloatArray:
         path = path_of(self._folder, self._fleet, agent, start, kind)

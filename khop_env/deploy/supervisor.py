@@ -57,13 +57,14 @@ class Process:
         setup: as it was started.
         port: that it has bound; 0 until it has said so.
         counts: what it said last of its messages.
-        ended: whether it has done all its rounds.
+        ended: whether it has nothing to do any more.
+        away: whether that is so before its rounds were over.
         error: what it stopped with, or "".
     """
 
     def __init__(self, setup: Setup, folder: Path, name: str) -> None:
         self.setup, self.port, self.counts, self.ended, self.error = setup, 0, {}, False, ""
-        self.round = -1
+        self.round, self.away = -1, False
         self._errors = folder / f"{name}.{setup.start}.stderr"
         root = str(Path(deploy.__file__).parents[2])
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -81,6 +82,11 @@ class Process:
         self.say(setup.to_json())
 
     counts: dict[str, Any]
+
+    @property
+    def state(self) -> str:
+        """In a word: "" while all is well."""
+        return "away" if self.away else "starting" if not self.port else "done" if self.ended else ""
 
     @property
     def alive(self) -> bool:
@@ -256,6 +262,7 @@ class Supervisor:
         if process.alive:
             self._forget(process)
             process.kill()
+            process.away = True
             self.killed[agent].append(self.now())
 
     def _restart(self, agent: int) -> None:
@@ -280,6 +287,7 @@ class Supervisor:
             if process.ended:
                 self._forget(process)
                 if process.error:
+                    process.away = True
                     name = self.scenario.fleet.ids[process.setup.agent]
                     self.errors.append(f"the process of {name} stopped: {process.error}")
                     self.killed[process.setup.agent].append(self.now())
