@@ -183,7 +183,7 @@ class Agent:
         if not self._due():
             return
         self.round = self._local_round()
-        self._take(self.receiver.late(self.round, in_step) if in_step else self._drained(late=True))
+        self._take(self.receiver.late(self.round) if in_step else self._drained(late=True))
         sealed = seal(self.node.message().pack(), self._run, self._key)
         for to in self._to:
             self.transport.send(sealed, to)
@@ -234,7 +234,7 @@ class Agent:
 
     def _drained(self, late: bool) -> list[Message]:
         self.receiver.take(self.transport.receive(), self.clock())
-        return self.receiver.late(self.round, False) if late else self.receiver.on_time(self.round)
+        return self.receiver.late(self.round) if late else self.receiver.on_time(self.round)
 
     def _wait(self) -> None:
         until = time.monotonic() + PATIENCE

@@ -64,19 +64,9 @@ class Receiver:
         """Agents whose message of round `now` hasn't come."""
         return [sender for sender, number in self._come.items() if number < now]
 
-    def late(self, now: int, in_step: bool) -> list[Message]:
-        """Messages of earlier rounds that arrive by round `now`, of each sender the newest, before this round's.
-
-        Args:
-            now: the round.
-            in_step: whether this round's messages are certain to come: an earlier one of a sender whose message of
-                this round arrives in it is left out then, as simulators do.
-        """
-        found = []
-        for sender in self._senders:
-            if not (in_step and self._arrival(sender, now) == now):
-                found += self._newest(sender, now, now - 1)
-        return found
+    def late(self, now: int) -> list[Message]:
+        """Messages of earlier rounds that arrive by round `now`, of each sender the newest, before this round's."""
+        return [message for sender in self._senders for message in self._newest(sender, now, now - 1)]
 
     def on_time(self, now: int) -> list[Message]:
         """The rest of the messages that have arrived by round `now`, of each sender the newest."""

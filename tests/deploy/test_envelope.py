@@ -136,7 +136,7 @@ def test_messages_share_the_fate_of_the_simulated_ones(network):
             waiting = []
         for link in links.values():
             link.advance()
-        receiver.late(number, False)
+        receiver.late(number)
         receiver.on_time(number)
         if not waiting:
             assert receiver.newest == {p: link.newest for p, link in links.items()}

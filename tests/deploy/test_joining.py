@@ -1,5 +1,8 @@
 """Agents that are killed, frozen, late, or have another clock: no bound is ever false, of anybody."""
 
+import heapq
+import math
+
 import numpy as np
 import pytest
 
@@ -65,6 +68,37 @@ def test_a_frozen_process_goes_on(seed, estimator, tmp_path):
     assert counts["refused"].get("replayed", 0) == 0
     bound = collected.recording.states.bound
     assert np.isfinite(bound[62:64]).all()
+
+
+@pytest.mark.parametrize("estimator", ["relay", "ppso"])
+def test_late_processes_in_any_order(estimator, tmp_path):
+    """Each runs its rounds when it gets to them, up to seconds late, and leaves out those that are over by then."""
+    rng, rounds = np.random.default_rng(0), 80
+    chosen, network = scenario_of(3), Network(0.05, loss=0.3, burst=5, latency=0.03, jitter=0.005)
+    now = 0.0
+    with Team(chosen, simulator_of(chosen, network, estimator, 0), tmp_path, rounds=rounds) as team:
+        waiting = [(0.0, a, 0) for a in range(len(team.agents))]  # heap of (when, in rounds; who; which round at least)
+        for agent in team.agents:
+            agent.clock = lambda: math.floor(now)
+        fresh = set(range(len(team.agents)))
+        while waiting:
+            now, a, number = heapq.heappop(waiting)
+            number = max(number, math.floor(now))
+            if number > rounds:
+                continue
+            agent = team.agents[a]
+            agent.catch_up(number - (a not in fresh))
+            agent.begin(first=a in fresh)
+            agent.end()
+            agent.write()
+            fresh.discard(a)
+            lateness = rng.exponential(0.3 if rng.random() < 0.9 else 5.0)
+            heapq.heappush(waiting, (max(now, number + 1 + lateness), a, number + 1))
+        team.step = rounds
+        collected = team.collected()
+        assert not any(agent.counts()["refused"] for agent in team.agents)
+    assert collected.violations == 0
+    assert sum(np.isnan(each.began).sum() for each in collected.rounds) > 40
 
 
 @pytest.mark.parametrize("skew", [0.03, 0.4])
