@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import math
 import shutil
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -120,9 +121,7 @@ def deploy(
         configuration = configuration_of(chosen, episode, "estimate", seed) | {"deploy": how}
         named = [chosen.name, episode.controller, "deploy", "lockstep" * lockstep, network or "", estimator or ""]
         folder = choose_folder(Path("runs") / folder_name(*named, f"seed{seed}"), out, configuration)
-        records = folder / "records"
-        shutil.rmtree(records, ignore_errors=True)
-        records.mkdir()
+        records = Path(tempfile.mkdtemp(prefix="records-", dir=folder))
         simulated = simulated_part(name, chosen, episode, law_of(chosen, controller), parts, rounds)
         setups = setups_of(chosen, simulated, seed=seed, skew=skew, transport=transport.value, records=records)
     with live_table(chosen, records, period) as watch:

@@ -283,37 +283,39 @@ def main() -> None:
     """Run one agent, as the lines on stdin say; ends as soon as stdin does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor ends its agents, by closing their stdin
     claim_agents()
+    out = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what a user's own scenario prints isn't for the supervisor
     try:
-        _run()
+        _run(out)
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        say(sys.stdout, error=str(error))
+        say(out, error=str(error))
         sys.exit(2)
 
 
-def _run() -> None:
+def _run(out: TextIO) -> None:
     setup = Setup(**json.loads(sys.stdin.readline()))
     scenario = scenario_of(setup.scenario)
     transport = transport_of(setup)
     agent = Agent(setup, scenario, control_of(setup, scenario), transport)
     gc.freeze()  # what is there now stays: collecting it again and again takes tens of milliseconds
-    say(sys.stdout, ready=transport.port)
+    say(out, ready=transport.port)
     order = json.loads(sys.stdin.readline() or "null")
     if order is None:
         return
     transport.meet({int(number): port for number, port in order["ports"].items()})
     if "begin" in order:
         threading.Thread(target=_end_with_stdin, daemon=True).start()
-        in_time(agent, order["begin"])
+        in_time(agent, order["begin"], out)
     else:
         if isinstance(transport, ZenohTransport):
             transport.wait()
-        in_step(agent)
-    say(sys.stdout, ended=agent.counts())
+        in_step(agent, out)
+    say(out, ended=agent.counts())
     agent.writer.close()
     transport.close()
 
 
-def in_step(agent: Agent) -> None:
+def in_step(agent: Agent, out: TextIO) -> None:
     """Rounds as the supervisor calls them, one for each line on stdin."""
     steps, first = agent.setup.steps, True
     for _ in sys.stdin:
@@ -323,17 +325,18 @@ def in_step(agent: Agent) -> None:
             agent.end(in_step=True)
             agent.write((0.0, 0.0, time.process_time() - began))
             first = False
-        say(sys.stdout, done=agent.round, **agent.counts())
+        say(out, done=agent.round, **agent.counts())
         if agent.robot.step >= agent.setup.last_step:
             return
 
 
-def in_time(agent: Agent, begin: float) -> None:
+def in_time(agent: Agent, begin: float, out: TextIO) -> None:
     """Rounds at multiples of the period, by the system's monotonic clock.
 
     Args:
         agent: runs them.
         begin: time 0 of the run, by that clock.
+        out: to the supervisor.
     """
     setup, period = agent.setup, agent.network.period
     last = setup.last_step // setup.steps
@@ -359,7 +362,7 @@ def in_time(agent: Agent, begin: float) -> None:
         cpu, number = used, number + 1
         if now - reported > _STATUS:
             reported = now
-            say(sys.stdout, status=agent.counts())
+            say(out, status=agent.counts())
 
 
 def say(stream: TextIO, **what: Any) -> None:

@@ -61,7 +61,12 @@ def test_lockstep_equals_the_simulator(seed, estimator, tmp_path):
 def test_processes_in_lockstep_equal_khop_run(transport, tmp_path, monkeypatch):
     """The command against the command, each agent a real process."""
     monkeypatch.chdir(tmp_path)
-    name = "random_geometric:agents=4,k=2"
+    (tmp_path / "mine.py").write_text(
+        "import sys\nfrom khop_env.registry import scenario\n"
+        "if sys.argv[0].endswith('agent.py'):\n    print('a process that says what nobody asked for')\n"
+        "mine = scenario('random_geometric:agents=4,k=2')\n"
+    )
+    name = "mine.py:mine"
     options = ("--duration", "0.8", "--network", "lossy:loss=0.3,burst=3", "--dt", "0.05")
     how = ("--lockstep", "--transport", transport, "--json", "--out", "a")
     deployed = json.loads(khop("deploy", name, *how, *options).stdout)
