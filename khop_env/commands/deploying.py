@@ -18,8 +18,8 @@ from khop_env.commands.episodes import Episode
 from khop_env.terminal import print_text, say
 
 if TYPE_CHECKING:
-    from khop_env.deploy.agent import Setup
     from khop_env.deploy.collect import Collected
+    from khop_env.deploy.setup import Setup
     from khop_env.deploy.supervisor import Kill, Supervisor, Watch
     from khop_env.observers import Networked
     from khop_env.scenarios import LawChoice, Scenario
@@ -138,7 +138,7 @@ def setups_of(
         transport: between processes.
         records: folder.
     """
-    from khop_env.deploy.agent import Setup
+    from khop_env.deploy.setup import Setup
 
     agents = range(len(scenario.fleet))
     offsets = np.random.default_rng([seed, _CLOCKS]).uniform(0.0, skew, len(agents)).tolist()

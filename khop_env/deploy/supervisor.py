@@ -21,8 +21,8 @@ from typing import Any
 
 from khop_env import deploy
 from khop_env.compiled import PLAIN
-from khop_env.deploy.agent import Setup
 from khop_env.deploy.record import Columns, rows_of
+from khop_env.deploy.setup import Setup
 from khop_env.scenarios import Scenario
 
 START = 120.0  # s until a process must have answered

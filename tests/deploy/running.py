@@ -13,8 +13,9 @@ import pytest
 
 from agents import make_law
 from khop_env.commands.deploying import setups_of, simulated_part
-from khop_env.deploy.agent import Agent, Setup, control_of
+from khop_env.deploy.agent import Agent
 from khop_env.deploy.collect import Collected, collect
+from khop_env.deploy.setup import Setup, control_of
 from khop_env.deploy.transport import UdpTransport
 from khop_env.network import Network
 from khop_env.observers import Exponential, Networked
