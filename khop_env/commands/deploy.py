@@ -13,9 +13,7 @@ import typer
 
 from khop_env.commands.common import (
     INTERRUPTED,
-    EstimatorOption,
     JsonOption,
-    NetworkOption,
     ScenarioArgument,
     load,
     mistakes,
@@ -62,14 +60,28 @@ def deploy(
             "default the longest step that is stable and certified."
         ),
     ] = None,
-    network: NetworkOption = None,
-    estimator: EstimatorOption = None,
+    network: Annotated[
+        str | None,
+        typer.Option(
+            help="What becomes of messages: ideal, factory, wifi, espnow, ... (khop network), also with other values, "
+            "lossy:loss=0.3,burst=5; by default the scenario's own, or ideal: one every 50 ms, none lost."
+        ),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            help="Estimates from messages: ppso (the paper's observers, by rounds) or relay (stamped states, passed "
+            "on); by default the scenario's."
+        ),
+    ] = None,
     transport: Annotated[
         TransportOption, typer.Option(help="UDP on 127.0.0.1, or Eclipse Zenoh, an extra.")
     ] = TransportOption.UDP,
     lockstep: Annotated[
         bool,
-        typer.Option("--lockstep", help="Each round waits for all agents: the same numbers as khop run --dt PERIOD."),
+        typer.Option(
+            "--lockstep", help="Each round waits for all agents: the same numbers as khop run with the same --dt."
+        ),
     ] = False,
     kill: Annotated[
         list[str] | None,
@@ -106,6 +118,8 @@ def deploy(
         if is_policy(controller):
             raise ValueError(f"--controller {controller}: khop deploy runs laws; for policies see khop run")
         over = over_network(chosen, network, estimator)
+        if not math.isfinite(skew):
+            raise ValueError(f"--skew must be a number of seconds; got {skew}")
         if lockstep and (kill or skew):
             raise ValueError("--lockstep waits for all agents, by one clock: leave out --kill and --skew")
         period = over.network.period
