@@ -83,7 +83,7 @@ Each agent's inputs as fractions of their limits, in [-1, 1]; larger values are 
 uniform observations all agents have as many entries as the largest, and ignore entries without an input.
 
 With `message_size` above 0, an action has as many entries more, at its end: data that the agent sends with its messages
-from the end of this control period on. They are passed on with its state, and arrive, or get lost, with it.
+from now on, until its next action. They are passed on with its state, and arrive, or get lost, with it.
 
 ### Reward
 

@@ -62,7 +62,8 @@ class SafetyFilter:
         margin: a `Margin`.
         gamma: share of the gap that two agents may use up in a period together, above 0 and at most 1.
         announce: whether integrators send their anchors in messages, so that disturbances and noise don't widen boxes.
-            Anchors then keep to the speed limit, so that an action may be changed where nothing is near, too.
+            Anchors then keep to the speed limit, and for 2 s to a tenth of it after an agent has rested, so that
+            an action may be changed where nothing is near, too. Integrators only.
         radius: of an agent's body in m; None for the column `radius` of observations.
         bounds: whether the policy inside observes bounds; None for what a learned policy was trained with, and no
             bounds for others.

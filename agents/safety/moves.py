@@ -16,9 +16,8 @@ from khop_env.compiled import compiled
 from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray, IntArray
 
-REST = 0.05  # of the pace: what an agent at rest announces as its pace for the next `REST_TIME`
+REST = 0.1  # of the pace: what an agent at rest announces as its pace for the next `REST_TIME`
 REST_TIME = 2.0  # s
-AT_REST = 0.25  # of the speed limit: an agent whose wanted input is at most this is at rest
 SLACK = 1e-6  # m: added to distances for that, and for rounding, of more periods than an episode has
 EPSILON = 2.0**-23  # twice the relative rounding of a float32
 ROUNDED = 1.0 + EPSILON
@@ -145,12 +144,11 @@ def filter_moves(
                 rows[row, 0], rows[row, 1] = (0.0, 0.0)
                 rows[row, row // 2] = 1.0 if row % 2 == 0 else -1.0
             pace_x, pace_y = columns.pace[i, 0] * period, columns.pace[i, 1] * period
+            at_rest = abs(wx) <= REST * pace_x and abs(wy) <= REST * pace_y
             if resting[b, i] > 0:
                 pace_x, pace_y = REST * pace_x, REST * pace_y
                 resting[b, i] -= 1
-            if abs(wanted[b, i, 0]) <= AT_REST * columns.speed[i, 0] and (
-                abs(wanted[b, i, 1]) <= AT_REST * columns.speed[i, 1]
-            ):
+            if at_rest:
                 resting[b, i] = most_resting
             rows[0, 2], rows[1, 2] = min(max(most_x + to_x, 0.0), pace_x), min(max(most_x - to_x, 0.0), pace_x)
             rows[2, 2], rows[3, 2] = min(max(most_y + to_y, 0.0), pace_y), min(max(most_y - to_y, 0.0), pace_y)
