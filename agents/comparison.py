@@ -19,7 +19,7 @@ from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv
-from khop_env.observers import FloatArray, Networked
+from khop_env.observers import Networked
 from khop_env.registry import Environment, make_batched
 from khop_env.results.metrics import finite
 from khop_env.results.recording import Progress

@@ -226,9 +226,10 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
     )
     print_text(
         "collided: episodes with a collision; success: all at their goals at the end, without any collision; deadlock: "
-        "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals, means with "
-        "the half width of theirs (±). time: until an agent's first arrival, mean over agents and successful episodes; distance: smallest of two "
-        "agents' centres; changed: by a filter or barrier, of each agent's inputs, mean over time; "
+        "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals, means "
+        "with the half width of theirs (±). time: until an agent's first arrival, mean over agents and successful "
+        "episodes; distance: smallest of two agents' centres; changed: by a filter or barrier, of each agent's inputs, "
+        "mean over time; "
         f"{infeasible if began_anew else ''}return: mean over agents of an episode's sum; e / bound: "
         "largest estimation error over its bound (below 1 by guarantee)"
     )
@@ -259,7 +260,7 @@ def _by_network(comparison: Comparison) -> Iterator[tuple[Row, list[tuple[str, .
     """Rows, those of a network together; before the first of each its name as a row, where there are several."""
     networks = list(dict.fromkeys(row.network for row in comparison.rows))
     for network in networks:
-        heading = [(folded(f"over {network}"),)] if len(networks) > 1 else []
+        heading: list[tuple[str, ...]] = [(folded(f"over {network}"),)] if len(networks) > 1 else []
         for row in comparison.rows:
             if row.network == network:
                 yield row, heading
