@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import statistics
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.evaluation import Episodes, chosen_scenario, play
-from agents.outcomes import summary
+from agents.outcomes import interval95, summary
 from agents.policies import Needs, make_policy, needs
 from agents.policy import EnvDescription, describe
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv
-from khop_env.observers import FloatArray, Networked
+from khop_env.observers import Networked
 from khop_env.registry import Environment, make_batched
 from khop_env.results.metrics import finite
 from khop_env.results.recording import Progress
@@ -43,13 +42,15 @@ class Row:
         policy: the policy's name as requested.
         env: description of the environment it acted in.
         episodes: measurements of its episodes.
-        network: in which it acted, as requested; None for that of the arguments or the scenario.
+        network: in which it acted: its name as requested, otherwise in words; None for continuous exchange.
+        compared: whether several networks are compared, so that labels name them.
     """
 
     policy: str
     env: EnvDescription
     episodes: Episodes
     network: str | None = None
+    compared: bool = False
 
     __repr__ = brief
 
@@ -61,7 +62,7 @@ class Row:
     @property
     def label(self) -> str:
         """Policy, observation mode, and network if several are compared, e.g. "tanh on estimate over wifi"."""
-        return f"{self.policy} on {self.observe}" + ("" if self.network is None else f" over {self.network}")
+        return f"{self.policy} on {self.observe}" + (f" over {self.network}" if self.compared else "")
 
     def summary(self) -> dict[str, Any]:
         """Means, medians and extremes over the episodes; a settling time that isn't finite is None."""
@@ -132,7 +133,7 @@ class Comparison:
         import polars as pl
 
         frames = [row.episodes.frame(row.policy, row.env) for row in self.rows]
-        if any(row.network is not None for row in self.rows):
+        if any(row.compared for row in self.rows):
             networks = [pl.lit(row.network).alias("network") for row in self.rows]
             frames = [frame.with_columns(network) for frame, network in zip(frames, networks, strict=True)]
         return pl.concat(frames)
@@ -211,11 +212,12 @@ def compare(
 
     def comparison() -> Comparison:
         result = Comparison(rows[0][1].environment, rows[0][1].scenario, len(seeds), *over)
-        for number, (spec, env, _, network) in enumerate(rows):
+        for number, (spec, env, needed, network) in enumerate(rows):
             played = results[number * len(chunks) : (number + 1) * len(chunks)]
             parts = [part for part in played if part is not None]  # workers may finish a later chunk first
             if parts:
-                result.rows.append(Row(spec, env, Episodes.joined(parts), network))
+                over_network = network or player.network(env.observe, needed)
+                result.rows.append(Row(spec, env, Episodes.joined(parts), over_network, networks is not None))
         return result
 
     try:
@@ -233,23 +235,6 @@ def compare(
     return comparison()
 
 
-def interval95(values: FloatArray) -> float | None:
-    """Half width of the 95 % confidence interval of the mean (Student's t); None for a single value.
-
-    The quantile is Cornish and Fisher's expansion (Abramowitz and Stegun, 26.7.5), within 1 % from 4 values on; exact
-    for 2 and 3.
-    """
-    if len(values) < 2:
-        return None
-    z, n = statistics.NormalDist().inv_cdf(0.975), len(values) - 1
-    if n < 3:
-        t = (12.7062, 4.3027)[n - 1]
-    else:
-        t = z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
-        t += (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
-    return t * float(np.std(values, ddof=1)) / math.sqrt(len(values))
-
-
 class _Player:
     """Runs tasks; builds one environment per observation mode and arguments, never shared with another object."""
 
@@ -265,6 +250,14 @@ class _Player:
             env = make_batched(self._environment, self._scenario, num_envs=CHUNK, observe=observe, **arguments)
             self._made[observe, needed, network] = env
         return self._made[observe, needed, network]
+
+    def network(self, observe: Observe, needed: Needs) -> str | None:
+        """The network's name where the arguments have one, otherwise in words; None for continuous exchange."""
+        observers = self.environment(observe, needed, None).simulator.observers
+        if not isinstance(observers, Networked):
+            return None
+        name = self._arguments.get("network")
+        return name if isinstance(name, str) else observers.network.described()
 
     def __call__(self, task: _Task) -> Episodes:
         spec, observe, needed, network, seeds = task

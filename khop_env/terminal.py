@@ -95,7 +95,7 @@ def print_table(
 
     Args:
         header: names of the columns.
-        rows: their cells.
+        rows: their cells; those that are left out at the end are empty.
         title: above it.
         width: in characters, where stdout is no terminal that has one.
         whole: columns that aren't folded at all.
@@ -106,6 +106,7 @@ def print_table(
     from rich.console import Console
     from rich.table import Table
 
+    rows = [(*row, *[""] * (len(header) - len(row))) for row in rows]
     columns = [[name, *(row[number] for row in rows)] for number, name in enumerate(header)]
     lengths = [[max(map(len, ["", *cell.splitlines()])) for cell in cells] for cells in columns]
     words = [max(len(word) for cell in cells for word in [*cell.split(), ""]) for cells in columns]

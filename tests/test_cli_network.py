@@ -242,6 +242,9 @@ def test_train_over_a_network(folder):
     assert "play it: khop evaluate consensus_v0 --network lossy:loss=0.3 --estimator relay --policies ppo:mine" in (
         " ".join(result.stdout.split())
     )
+    progress = result.stderr
+    assert "agent-steps: return" in progress
+    assert "|e|" not in progress  # of an estimator without funnels
     config = Path("mine/config.toml").read_text()
     assert "lossy" in config or "0.3" in config
     played = only_json(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -161,8 +162,9 @@ def print_comparison(comparison: Comparison) -> None:
     if comparison.rows[0].episodes.outcomes:
         _print_outcomes(comparison, title)
         return
-    rows = []
-    for number, row in enumerate(comparison.rows):
+    rows: list[tuple[str, ...]] = []
+    for row, heading in _by_network(comparison):
+        rows += heading
         seen = row.summary()
         more, interval = comparison.difference(row)
         settling = seen["settling_time"]
@@ -170,7 +172,9 @@ def print_comparison(comparison: Comparison) -> None:
             (
                 _name(row, comparison),
                 _with_interval(seen["mean_return"], seen["ci95"]),
-                _with_interval(more, interval, sign="+") if number and not math.isnan(more) else "",
+                _with_interval(more, interval, sign="+")
+                if row is not comparison.rows[0] and not math.isnan(more)
+                else "",
                 f"{seen['final_task_error']:.3g}",
                 "never" if settling is None else f"{settling:.3g}",
                 f"{seen['effort']:.3g}",
@@ -185,7 +189,7 @@ def print_comparison(comparison: Comparison) -> None:
     guarantee = "bound (of all observers, below 1 by guarantee)"
     if networked:
         guarantee = "certified bound (at most 1 by guarantee)"
-    print_table(header, rows, title)
+    print_table(header, rows, title, whole=header[:1])
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
         "mean over agents and episodes, at the end; settled: median time from which the team's mean task error stays "
@@ -196,36 +200,47 @@ def print_comparison(comparison: Comparison) -> None:
 
 def _print_outcomes(comparison: Comparison, title: str) -> None:
     """The table of an environment in which agents may collide."""
-    rows, began_anew = [], any(row.summary()["infeasible"] for row in comparison.rows)
-    for row in comparison.rows:
+    rows: list[tuple[str, ...]] = []
+    began_anew = any(row.summary()["infeasible"] for row in comparison.rows)
+    for row, heading in _by_network(comparison):
+        rows += heading
         seen = row.summary()
-        filtered, time = seen["intervention"], seen["arrival_time"]
+        filtered = seen["intervention"]
         rows.append(
             (
                 _name(row, comparison),
                 *(_rate(seen[f"{name}_rate"], seen[f"{name}_ci95"]) for name in ("collision", "success", "deadlock")),
-                "" if time is None else f"{time:.3g}",
+                _mean(seen, "arrival_time", ".3g"),
                 f"{seen['min_distance']:.3f}",
-                "" if filtered is None else f"{filtered:.3f}",
+                _mean(seen, "intervention", ".3f"),
                 *["" if filtered is None else f"{100.0 * seen['infeasible']:.2g}"] * began_anew,
                 f"{seen['mean_return']:.2f}" + ("" if seen["ci95"] is None else f"\n±{seen['ci95']:.2f}"),
                 f"{seen['max_error_to_bound']:.3f}",
             )
         )
     header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)")
-    print_table((*header, *["infeasible %"] * began_anew, "return", "e / bound"), rows, title, whole=header[1:4])
+    print_table((*header, *["infeasible %"] * began_anew, "return", "e / bound"), rows, title, whole=header[:4])
     infeasible = (
         "infeasible: share of agents and time in which a filter's guarantee had to be begun anew, or a barrier had no "
         "solution; "
     )
     print_text(
         "collided: episodes with a collision; success: all at their goals at the end, without any collision; deadlock: "
-        "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals. "
-        "time: until an agent's first arrival, mean over agents and successful episodes; distance: smallest of two "
-        "agents' centres; changed: by a filter or barrier, of each agent's inputs, mean over time; "
-        f"{infeasible if began_anew else ''}return: mean over agents of an episode's sum, 95 % interval; e / bound: "
+        "not all at their goals, and nobody has moved by 0.1 m in the last 2 s; with Wilson's 95 % intervals, means "
+        "with the half width of theirs (±). time: until an agent's first arrival, mean over agents and successful "
+        "episodes; distance: smallest of two agents' centres; changed: by a filter or barrier, of each agent's inputs, "
+        "mean over time; "
+        f"{infeasible if began_anew else ''}return: mean over agents of an episode's sum; e / bound: "
         "largest estimation error over its bound (below 1 by guarantee)"
     )
+
+
+def _mean(seen: Mapping[str, Any], name: str, digits: str) -> str:
+    """A mean of a row's summary, with the half width of its interval below; empty where there is none."""
+    if seen[name] is None:
+        return ""
+    half = seen[f"{name}_ci95"]
+    return f"{seen[name]:{digits}}" + ("" if half is None else f"\n±{half:{digits}}")
 
 
 def _rate(rate: float, interval: list[float]) -> str:
@@ -235,11 +250,21 @@ def _rate(rate: float, interval: list[float]) -> str:
 
 
 def _name(row: Row, comparison: Comparison) -> str:
-    """Policy, mode, network where there are several, and the number of episodes if some are missing."""
-    network = f" over {row.network}" if len({each.network for each in comparison.rows}) > 1 else ""
+    """Policy, mode, and the number of episodes if some are missing."""
     count = len(row.episodes.seed)
     few = "" if count == comparison.planned else f" ({count} episodes)"
-    return f"{folded(row.policy)} on {row.observe}{network}{few}"
+    return f"{folded(row.policy)} on {row.observe}{few}"
+
+
+def _by_network(comparison: Comparison) -> Iterator[tuple[Row, list[tuple[str, ...]]]]:
+    """Rows, those of a network together; before the first of each its name as a row, where there are several."""
+    networks = list(dict.fromkeys(row.network for row in comparison.rows))
+    for network in networks:
+        heading: list[tuple[str, ...]] = [(folded(f"over {network}"),)] if len(networks) > 1 else []
+        for row in comparison.rows:
+            if row.network == network:
+                yield row, heading
+                heading = []
 
 
 def _with_interval(value: float, interval: float | None, sign: str = "") -> str:

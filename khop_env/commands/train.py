@@ -152,9 +152,10 @@ def train(
         def report(fraction: float, evaluation: Evaluation | None) -> None:
             progress(fraction)
             if evaluation is not None:
+                disagreement = evaluation.max_normalized_disagreement  # 0 for estimators without funnels
                 progress.say(
                     f"{evaluation.timesteps:>11,} agent-steps: return {evaluation.mean_return:.3f}, task error "
-                    f"{evaluation.final_task_error:.3f} {unit}, |e| {evaluation.max_normalized_disagreement:.3f}"
+                    f"{evaluation.final_task_error:.3f} {unit}" + (f", |e| {disagreement:.3f}" if disagreement else "")
                 )
 
         training = train(chosen, folder, resume=resume, on_progress=report)

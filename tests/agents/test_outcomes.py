@@ -8,12 +8,13 @@ import pytest
 from scipy.stats import binomtest
 from typer.testing import CliRunner
 
-from agents import compare, describe, make_policy, play
-from agents.outcomes import wilson95
+from agents import compare, describe, interval95, make_policy, play
+from agents.outcomes import summary, wilson95
 from agents.policy import policy_seeds
 from agents.running import PolicyRun, policy_run
 from khop_env import make_batched, navigation_v0
 from khop_env.cli import app
+from khop_env.network import Network
 from khop_env.registry import scenario
 
 
@@ -89,6 +90,11 @@ def test_rates_and_times_of_a_row():
     assert row["min_distance"] == outcomes["min_distance"].min() < 0.4
     assert (row["intervention"], row["infeasible"]) == (None, None)
     assert idle["arrival_time"] is None
+    half = interval95(outcomes["arrival_time"][outcomes["success"] == 1.0])
+    assert row["arrival_time_ci95"] == half > 0.0
+    assert (row["intervention_ci95"], idle["arrival_time_ci95"]) == (None, None)
+    changed = play(make_batched("navigation_v0", "crossing:agents=4"), Slowed(), range(3)).outcomes
+    assert summary(changed)["intervention_ci95"] == interval95(changed["intervention"]) > 0.0
     assert table.frame()["collision"].sum() == outcomes["collision"].sum()
     assert compare("consensus_v0", ["zero"], seeds=range(2)).rows[0].episodes.outcomes == {}
 
@@ -111,9 +117,26 @@ def test_several_networks_in_one_table():
     for number, network in enumerate(networks):
         alone = compare("consensus_v0", ["tanh"], arguments={"max_cycles": 30, "network": network}, seeds=range(3))
         np.testing.assert_array_equal(table.rows[number].episodes.returns, alone.rows[0].episodes.returns)
-        assert "network" not in alone.rows[0].summary()
+        assert alone.rows[0].summary()["network"] == network
+        assert alone.rows[0].label == "tanh on estimate"
+        assert "network" not in alone.frame().columns
     with pytest.raises(ValueError, match="networks must be names, and arguments without a network then"):
         compare("consensus_v0", ["tanh"], networks=networks, arguments={"network": "wifi"})
+
+
+def test_rows_name_their_network_wherever_it_comes_from():
+    """Of the arguments, or the scenario's own in words; none for continuous exchange."""
+
+    def network(scenario, **arguments):
+        table = compare(
+            "navigation_v0", ["zero"], scenario=scenario, seeds=[0], arguments={"max_cycles": 2, **arguments}
+        )
+        return table.rows[0].summary()["network"]
+
+    assert network("crossing") == "a message every 50 ms, 30 % lost in bursts of 5"
+    assert network("crossing", network=Network()) == "a message every 50 ms, none lost"
+    assert network("crossing", network="none") is None
+    assert network("crossing:continuous=true") is None
 
 
 def test_the_command_prints_rates_and_networks():
@@ -130,6 +153,12 @@ def test_the_command_prints_rates_and_networks():
     ]
     measured = {"collision_rate", "success_rate", "arrival_time", "min_distance", "deadlock_rate", "intervention"}
     assert measured | {"infeasible"} < set(rows[0])
+    alone = json.loads(khop("--network", "ideal", "--json", "--env", "max_cycles=20").stdout)["rows"]
+    assert [row["network"] for row in alone] == ["ideal"] * 3
+    both = khop("--policies", "zero,random", "--network", "ideal,wifi", "--env", "max_cycles=20").stdout
+    lines = [" ".join(line.split()[:2]) for line in both.splitlines()]
+    named = [line for line in lines if line in ("over ideal", "over wifi", "zero on", "random on")]
+    assert named == ["over ideal", "zero on", "random on", "over wifi", "zero on", "random on"]
     table = khop("--policies", "zero", "--env", "max_cycles=20").stdout
     assert "navigation_v0 on crossing over a network (a message every 50 ms" in table
     assert "collided" in table
