@@ -135,7 +135,36 @@ def policy_run(
     environment: Environment | None = None,
     arguments: Mapping[str, Any] | None = None,
 ) -> PolicyRun:
-    """A policy in an environment, at the beginning of an episode.
+    """A policy in an environment, at the beginning of an episode: see `policy_and_environment`.
+
+    Args:
+        spec: as there.
+        scenario: as there.
+        observe: as there.
+        duration: as there.
+        seed: of the episode.
+        environment: as there.
+        arguments: as there.
+
+    Raises:
+        ValueError: as there, or for a policy that doesn't fit its observations.
+    """
+    policy, env = policy_and_environment(
+        spec, scenario, observe, duration, environment=environment, arguments=arguments
+    )
+    return PolicyRun(env, policy, seed, spec)
+
+
+def policy_and_environment(
+    spec: str,
+    scenario: Scenario,
+    observe: Observe,
+    duration: float | None,
+    *,
+    environment: Environment | None = None,
+    arguments: Mapping[str, Any] | None = None,
+) -> tuple[Policy, KHopEnv]:
+    """A policy and an environment for it, none of them reset.
 
     A learned policy gets the bounds and arguments that it was trained with, unless `arguments` have others.
 
@@ -144,7 +173,6 @@ def policy_run(
         scenario: where it acts.
         observe: observation mode.
         duration: of the episode in s, rounded up to whole control periods; None for that of the environment.
-        seed: of the episode.
         environment: name or task; `environment_for` chooses by default.
         arguments: of the environment.
 
@@ -164,7 +192,7 @@ def policy_run(
             raise ValueError("a duration and max_cycles: choose one of them for the length of the episode")
         period = chosen.get("control_period", Settings.control_period)
         chosen["max_cycles"] = max(1, math.ceil(duration / period - 1e-9))
-    return PolicyRun(make(environment, scenario, observe=observe, **chosen), policy, seed, spec)
+    return policy, make(environment, scenario, observe=observe, **chosen)
 
 
 def environment_for(spec: str, scenario: Scenario) -> str:
@@ -176,14 +204,15 @@ def environment_for(spec: str, scenario: Scenario) -> str:
 
     Returns:
         What a learned policy was trained for; for others the environment that it is the default policy of, that of the
-        scenario's law, or consensus.
+        scenario's law, navigation where the scenario has an arena, or consensus.
 
     Raises:
         ValueError: if a learned policy was trained for a task that isn't of the library.
     """
     of_law = f"{scenario.law.name}_v0"
     of_policy = [name for name in environments() if find_task(name).default_policy == spec.partition(":")[0]]
-    other = of_policy[0] if of_policy else of_law if of_law in environments() else "consensus_v0"
+    of_scenario = "consensus_v0" if scenario.arena is None else "navigation_v0"
+    other = of_policy[0] if of_policy else of_law if of_law in environments() else of_scenario
     found: str = _training(make_policy(spec), None, scenario).get("environment", other)
     if found not in environments():
         raise ValueError(

@@ -54,7 +54,7 @@ def replay(chosen: Scenario, run: tuple[list[FloatArray], list[FloatArray]], est
         for sender, receiver in design.links.index:
             nodes[receiver].receive(sent[sender])
         for a, node in enumerate(nodes):
-            for target, (estimate, bound, _) in node.estimates(clocks[a]).items():
+            for target, (estimate, bound, *_) in node.estimates(clocks[a]).items():
                 i = fleet.agent(target)
                 error, position = np.abs(estimate - x[fleet.state_slice(i)]), fleet.models[i].position_index
                 above += bool((error > bound * (1.0 + 1e-9) + 1e-12).any())

@@ -56,7 +56,7 @@ def replay(folder):
                 nodes[robot].receive(Message.unpack(air[link.newest][sender], design))
 
         for node in nodes:
-            for target, (estimate, bound, age) in node.estimates(t).items():
+            for target, (estimate, bound, age, *_) in node.estimates(t).items():
                 error = np.abs(estimate - x[sample, fleet.state_slice(fleet.agent(target))])
                 checked, outside = checked + 1, outside + (error > bound).any()
                 if node is watched and number in (3, 10, 40):

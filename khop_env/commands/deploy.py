@@ -31,7 +31,7 @@ from khop_env.commands.deploying import (
     simulated_part,
     steps_per_round,
 )
-from khop_env.commands.episodes import configuration_of, continuous, is_policy, law_of
+from khop_env.commands.episodes import configuration_of, continuous, is_policy, law_of, played_episode
 from khop_env.commands.folders import choose_folder, folder_name
 from khop_env.terminal import say, waiting
 
@@ -50,7 +50,10 @@ def deploy(
     name: ScenarioArgument,
     controller: Annotated[
         str | None,
-        typer.Option(help="A law, with parameters or without (linear:gain=2). By default the scenario's law."),
+        typer.Option(
+            help="A law, with parameters or without (linear:gain=2), or a policy as in khop run: filter, "
+            "ppo:pretrained, my_file.py:MyPolicy. By default the scenario's law."
+        ),
     ] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds; by default the scenario's.")] = None,
     dt: Annotated[
@@ -115,17 +118,29 @@ def deploy(
 
     with mistakes(name), waiting(f"designing the observers of {name}"):
         chosen = load(name)
-        if is_policy(controller):
-            raise ValueError(f"--controller {controller}: khop deploy runs laws; for policies see khop run")
         over = over_network(chosen, network, estimator)
         if not math.isfinite(skew):
             raise ValueError(f"--skew must be a number of seconds; got {skew}")
         if lockstep and (kill or skew):
             raise ValueError("--lockstep waits for all agents, by one clock: leave out --kill and --skew")
         period = over.network.period
-        steps = {"--dt": period, "--order": None, "--integrator": None}
-        episode = continuous(chosen, controller, "estimate", duration, steps, seed, over)
-        parts = steps_per_round(episode, period, dt)
+        played = policies = None
+        if is_policy(controller):
+            from agents.deployed import policy_setups, steps_of
+
+            if dt is not None:
+                raise ValueError("--dt: a policy acts in its environment, which chooses its own steps; leave it out")
+            profile = network or ("ideal" if chosen.network is None else None)
+            episode = played_episode(
+                name, None, chosen, controller, "estimate", duration, seed, None, profile, estimator
+            )
+            played = episode.played
+            assert played is not None
+            parts, policies = steps_of(played, period), policy_setups(played, seed)
+        else:
+            steps = {"--dt": period, "--order": None, "--integrator": None}
+            episode = continuous(chosen, controller, "estimate", duration, steps, seed, over)
+            parts = steps_per_round(episode, period, dt)
         episode.dt = period / parts
         rounds = math.floor(episode.duration / period + 1e-9)
         episode.duration = rounds * period
@@ -136,8 +151,11 @@ def deploy(
         named = [chosen.name, episode.controller, "deploy", "lockstep" * lockstep, network or "", estimator or ""]
         folder = choose_folder(Path("runs") / folder_name(*named, f"seed{seed}"), out, configuration)
         records = Path(tempfile.mkdtemp(prefix="records-", dir=folder))
-        simulated = simulated_part(name, chosen, episode, law_of(chosen, controller), parts, rounds)
-        setups = setups_of(chosen, simulated, seed=seed, skew=skew, transport=transport.value, records=records)
+        law = chosen.law if policies else law_of(chosen, controller)
+        simulated = simulated_part(name, chosen, episode, law, parts, rounds)
+        setups = setups_of(
+            chosen, simulated, seed=seed, skew=skew, transport=transport.value, records=records, policies=policies
+        )
     with live_table(chosen, records, period) as watch:
         supervisor = Supervisor(chosen, setups, in_step=lockstep, kills=kills, watch=watch)
         with mistakes():
@@ -155,6 +173,11 @@ def deploy(
             observe="estimate",
         )
         summary |= {"violations": collected.violations, "pair_samples": collected.pair_steps}
+        if played is not None:
+            from agents.deployed import result_of
+
+            in_a_cycle = round(played.env.batched.settings.control_period / episode.dt)
+            summary |= result_of(played, collected.x, collected.u, in_a_cycle)
         summary |= {"configuration": configuration, "deploy": {**how, **found, "left_out": left_out}}
         unwritten: RunFileError | None = None
         try:

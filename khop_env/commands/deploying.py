@@ -126,7 +126,14 @@ def simulated_part(
 
 
 def setups_of(
-    scenario: Scenario, common: Mapping[str, Any], *, seed: int, skew: float, transport: str, records: Path
+    scenario: Scenario,
+    common: Mapping[str, Any],
+    *,
+    seed: int,
+    skew: float,
+    transport: str,
+    records: Path,
+    policies: Sequence[Mapping[str, Any]] | None = None,
 ) -> list[Setup]:
     """What each process has to know.
 
@@ -137,6 +144,7 @@ def setups_of(
         skew: their largest difference, in s.
         transport: between processes.
         records: folder.
+        policies: by agent what its process has to know of a policy; None for a law.
     """
     from khop_env.deploy.setup import Setup
 
@@ -151,6 +159,7 @@ def setups_of(
             offset=offsets[agent],
             skew=skew,
             transport=transport,
+            policy=None if policies is None else policies[agent],
         )
         for agent in agents
     ]

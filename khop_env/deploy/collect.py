@@ -48,12 +48,16 @@ class Collected:
         violations: errors above their certified bounds by more than rounding, over all steps.
         pair_steps: pairs and steps that were looked at.
         rounds: by agent.
+        x: (steps + 1, n) true states after every step, of which the recording has some.
+        u: (steps + 1, m) inputs in force from then on.
     """
 
     recording: Recording
     violations: int
     pair_steps: int
     rounds: list[Rounds]
+    x: FloatArray
+    u: FloatArray
 
 
 def collect(
@@ -199,7 +203,7 @@ def _collected(
         wall_time=wall_time,
         error=error,
     )
-    return Collected(recording, wrong, layout.pairs * count, rounds)
+    return Collected(recording, wrong, layout.pairs * count, rounds, x, u)
 
 
 def measured(

@@ -87,8 +87,8 @@ class Writer:
         """A row of knowledge."""
         row = [step, *timing, *u.tolist(), *newest.values()]
         for target in self._ids:
-            estimate, bound, age = estimates[target]
-            row += [age, *estimate.tolist(), *bound.tolist()]
+            known = estimates[target]
+            row += [known.age, *known.estimate.tolist(), *known.bound.tolist()]
         self._knowledge.write(np.array(row, np.float64).tobytes())
 
     def close(self) -> None:

@@ -28,6 +28,8 @@ class Setup:
         law: place of a function that makes a law of a `LawChoice`, "agents.laws:make_law".
         law_name: which law.
         law_parameters: its parameters.
+        policy: keyword arguments of a policy's control in place of a law, `make` its place, and `memory` by name the
+            task's own arrays for this agent; None for a law.
         x: the agent's state, at `first_step`.
         first_step: step that `x` is of. Until its process begins its input is 0.
         drawn: random numbers of the disturbance.
@@ -60,6 +62,7 @@ class Setup:
     offset: float = 0.0
     skew: float = 0.0
     start: int = 0
+    policy: Mapping[str, Any] | None = None
     transport: str = "udp"
     port: int = 0
 
@@ -83,6 +86,13 @@ def transport_of(setup: Setup) -> UdpTransport | ZenohTransport:
 
 
 def control_of(setup: Setup, scenario: Scenario) -> Control:
-    """The law of a setup."""
+    """The law or policy of a setup."""
+    if setup.policy is not None:
+        arguments = dict(setup.policy)
+        make = load_object(arguments.pop("make"))
+        control: Control = make(
+            scenario, setup.agent, network=network_of(setup), estimator=setup.estimator, **arguments
+        )
+        return control
     law = load_object(setup.law)(LawChoice(setup.law_name, setup.law_parameters))
     return LawControl(law, scenario.fleet, setup.agent, scenario.task)

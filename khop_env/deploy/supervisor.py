@@ -69,13 +69,14 @@ class Process:
         root = str(Path(deploy.__file__).parents[2])
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        plain = {PLAIN: "1"} if setup.policy is None else {}  # a safety filter's kernels are slow without a compiler
         with open(self._errors, "wb") as errors:
             self.popen = subprocess.Popen(
                 [sys.executable, "-m", "khop_env.deploy.agent"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                env={**os.environ, "PYTHONPATH": path, PLAIN: "1", **threads},
+                env={**os.environ, "PYTHONPATH": path, **plain, **threads},
                 process_group=0,  # Ctrl-C is for the supervisor; a stopped one is woken when it is orphaned
             )
         self._text = b""

@@ -6,8 +6,8 @@
         radio.send(node.message().pack())
         for data in radio.received():
             node.receive(Message.unpack(data, design))
-        for target, (estimate, bound, age) in node.estimates(t).items():
-            ...                                       # |x_target - estimate| <= bound, component by component
+        for target, known in node.estimates(t).items():
+            ...                                       # |x_target - known.estimate| <= known.bound, by component
 
 That is a round of messages, in this order. Time t is in seconds since the fleet started, the same for all its agents up
 to `skew`. Messages may be lost, late, doubled or out of order: bounds become wider, never wrong. What can't be right is
@@ -283,7 +283,7 @@ class ObserverNode:
         sent[sender] = (message.state, message.time, 1)
         fresh = {}
         for i, (state, stamp, hops) in sent.items():
-            received = Received(state, stamp, hops, (self._updates, dt > 0.0), sender)
+            received = Received(state, stamp, hops, (self._updates, dt > 0.0), sender, self.time)
             if i in self._targets and received.replaces(self._targets[i].freshest):
                 fresh[i] = received._replace(state=self._targets[i].moved(state, message.time, dt))
         for i, received in fresh.items():

@@ -29,11 +29,15 @@ class Estimate(NamedTuple):
         estimate: (n_i,) of its state.
         bound: (n_i,) certified bound on each component's error; inf where nothing is certified.
         age: time since the target measured what the node knows of it, in s; inf while nothing has arrived.
+        hops: links over which that has come; 0 while nothing has arrived.
+        since: time since it arrived, in s; inf while nothing has arrived.
     """
 
     estimate: FloatArray
     bound: FloatArray
     age: float
+    hops: int
+    since: float
 
 
 class Received(NamedTuple):
@@ -45,6 +49,7 @@ class Received(NamedTuple):
         hops: links that it has come over; 0 while nothing has arrived.
         merging: when it was merged: messages that are merged at the same stage of a round are merged at once.
         sender: whose message it was.
+        arrived: when it was merged, in s.
     """
 
     state: FloatArray
@@ -52,6 +57,7 @@ class Received(NamedTuple):
     hops: int = 0
     merging: tuple[int, bool] = (0, False)
     sender: int = -1
+    arrived: float = -math.inf
 
     def replaces(self, other: Received) -> bool:
         """Whether it is fresher: of those merged at once the lowest sender's wins a tie, else what was there before."""
@@ -165,7 +171,7 @@ class RemoteAgent:
         estimate = box.clip(proposal)
         # an empty box proves that some assumption doesn't hold: then nothing is certain
         bound = np.full(len(state), math.inf) if box.empty() else box.far_face(estimate)
-        return Estimate(estimate, bound, t - known.stamp)
+        return Estimate(estimate, bound, t - known.stamp, known.hops, t - known.arrived)
 
     def _box(self, state: FloatArray, t: float) -> Box:
         """Where the agent is for certain, if `state` is what is predicted for now, `t`."""

@@ -82,7 +82,7 @@ class Clocks(Ramming):
             known = self.nodes[i].estimates(self.time + self.offsets[i])
             values = {"radius": self.radius, "own.x": self.x[:, i, 0], "own.y": self.x[:, i, 1]}
             for number, slot in enumerate(layout.slots):
-                estimate, bound, _ = known[slot.id]
+                estimate, bound, *_ = known[slot.id]
                 values |= {f"slot{number}.valid": 1.0, f"slot{number}.age": 0.0}
                 self.excess = max(self.excess, float((np.abs(estimate - self.x[0, slot.agent]) - bound).max()))
                 for c, axis in enumerate("xy"):

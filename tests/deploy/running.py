@@ -6,6 +6,7 @@ import importlib.util
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import networkx as nx
 import numpy as np
@@ -82,6 +83,7 @@ class Team:
         steps: per round.
         rounds: of the run.
         skew: of the clocks, in s.
+        policies: as for `setups_of`.
     """
 
     def __init__(
@@ -93,11 +95,12 @@ class Team:
         steps: int = 1,
         rounds: int = 40,
         skew: float = 0.0,
+        policies: list[dict[str, Any]] | None = None,
     ) -> None:
         self.chosen, self.simulator, self.folder, self.steps = chosen, simulator, folder, steps
         episode = SimpleNamespace(simulator=simulator, observers=simulator.observers)
         common = simulated_part(chosen.name, chosen, episode, chosen.law, steps, rounds)  # type: ignore[arg-type]
-        self.setups = setups_of(chosen, common, seed=0, skew=skew, transport="udp", records=folder)
+        self.setups = setups_of(chosen, common, seed=0, skew=skew, transport="udp", records=folder, policies=policies)
         self.agents: list[Agent | None] = [self._made(setup) for setup in self.setups]
         self.ports = {a: agent.transport.port for a, agent in enumerate(self.agents)}
         for agent in self.agents:

@@ -102,7 +102,6 @@ def test_processes_in_lockstep_equal_khop_run(transport, tmp_path, monkeypatch):
         (("paper", "--kill", "drifter_1"), "write AGENT@T or AGENT@T:RESTART_T"),
         (("paper", "--kill", "drifter_1@3:2"), "times must be in order"),
         (("paper", "--kill", "drifter_1@3000"), "before the end, 10 s"),
-        (("paper", "--controller", "random"), "khop deploy runs laws"),
         (("paper", "--skew", "inf"), "--skew must be a number of seconds; got inf"),
         (("paper", "--estimator", "ppsi"), "did you mean 'ppso'"),
         (("paper", "--dt", "0.03"), "must be a whole number of steps"),

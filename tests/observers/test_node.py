@@ -101,7 +101,7 @@ def test_a_round_by_hand() -> None:
     assert node.receive(late)
     assert not node.receive(late)
     found = node.estimates(T)
-    estimate, bound, age = found["integrator_0"]
+    estimate, bound, age, *_ = found["integrator_0"]
     assert age == pytest.approx(T / 2)
     radius = Certificate(design.fleet.models[0], start=0.01).radius(np.array(T / 2))[0]
     assert estimate == pytest.approx(np.clip(node._states[0].estimate, 1.2 - radius, 1.2 + radius))
@@ -188,7 +188,7 @@ def test_loss_delay_doubling_and_another_order_only_widen(estimator: str, seed: 
         arriving, waiting = waiting[: rng.integers(len(waiting) + 1)], waiting
         for message in arriving:
             poor.receive(message)
-        for target, (estimate, _, age) in best.estimates(step * T).items():
+        for target, (estimate, _, age, *_) in best.estimates(step * T).items():
             other = poor.estimates(step * T)[target]
             assert other.age >= age
             if estimator == "relay":

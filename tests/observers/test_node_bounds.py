@@ -44,7 +44,7 @@ def test_no_error_exceeds_its_certified_bound(model, estimator, dtype) -> None:
         rounds.update(t, x, u)
         guess = x.copy()
         for found in rounds.estimates(t):
-            for target, (estimate, bound, _) in found.items():
+            for target, (estimate, bound, *_) in found.items():
                 true = fleet.state_slice(fleet.agent(target))
                 error = np.abs(estimate - x[true])
                 assert np.isfinite(bound).all()
@@ -90,7 +90,7 @@ def test_a_clock_skew_widens_bounds_by_age_and_drift() -> None:
                 if step % 3 != a:
                     nodes[a].receive(nodes[p].message())
             for clock, node in zip(clocks, nodes, strict=True):
-                for estimate, bound, _ in node.estimates(clock).values():
+                for estimate, bound, *_ in node.estimates(clock).values():
                     broken[assumed] |= bool((np.abs(estimate - x) > bound + 1e-12).any())
     assert broken == {0.0: True, skew: False}
 
