@@ -44,6 +44,7 @@ SLOW = tuple(
         # processes, one or more per test
         "agents/test_workers.py",
         "deploy/test_lockstep.py::test_processes",
+        "deploy/test_policies.py::test_real_processes",
         "deploy/test_processes.py",
         "env/test_concurrency.py",
         "agents/test_evaluation.py::test_the_same_numbers",

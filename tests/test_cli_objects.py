@@ -204,6 +204,7 @@ class TestRun:
             ("paper", "zero", "consensus_v0"),
             ("random_geometric:agents=12", "random", "consensus_v0"),
             ("mixed_fleet", "ppo:pretrained", "leader_following_v0"),
+            ("swap:agents=4", "filter", "navigation_v0"),
             ("my_file.py:scenario", "my_file.py:MyPolicy", "consensus_v0"),
         ],
     )

@@ -104,7 +104,7 @@ def deploy(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a scenario with one process per agent: its plant, its law, its observers, and messages between them.
+    """Run a scenario with one process per agent: its plant, law or policy, and observers, and messages between them.
 
     Rounds take place at multiples of the network's period, by the system's clock. Losses and delays are made at the
     receiver, by the same random numbers as in khop run; with --lockstep everything else is the same, too.

@@ -1,9 +1,9 @@
-"""One agent: its plant, its law, its observers and its messages, round by round; and its process.
+"""One agent: its plant, its controller, its observers and its messages, round by round; and its process.
 
     python -m khop_env.deploy.agent           # started by the supervisor, which it talks to in lines of JSON
 
 A round: the plant moves on, the node predicts, what came late is taken in, the message is sent, what is on time is
-taken in, and the law acts on the estimates. This is the order of `ObserverNode`, and of the simulator.
+taken in, and the controller acts on the estimates. This is the order of `ObserverNode`, and of the simulator.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Agent:
     Args:
         setup: what it has to know.
         scenario: the scenario that `setup` names.
-        control: its law.
+        control: its law or policy.
         transport: for its messages.
 
     Attributes:
@@ -134,7 +134,7 @@ class Agent:
         self.sent += len(self._to)
 
     def end(self, in_step: bool = False) -> None:
-        """The second half: what is on time is taken in, and the law acts.
+        """The second half: what is on time is taken in, and the controller acts.
 
         Raises:
             TimeoutError: in step, if a message doesn't come.

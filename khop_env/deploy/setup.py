@@ -25,7 +25,7 @@ class Setup:
         estimator: "ppso" or "relay".
         steps: of the plant, in each of which the law acts, per round.
         last_step: with which the run ends.
-        law: place of a function that makes a law of a `LawChoice`, "agents.laws:make_law".
+        law: place of a function that makes a law of a `LawChoice`, "agents.laws:make_law"; not used with a policy.
         law_name: which law.
         law_parameters: its parameters.
         policy: keyword arguments of a policy's control in place of a law, `make` its place, and `memory` by name the

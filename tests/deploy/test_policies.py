@@ -124,9 +124,22 @@ def test_real_processes_in_real_time(tmp_path):
         (("swap:agents=4", "--controller", "filter:announce=true"), "leave announce out"),
         (("swap:agents=4", "--controller", "filter", "--dt", "0.05"), "--dt: a policy acts in its environment"),
         (("swap:agents=4", "--controller", "filter", "--network", "wifi:period=0.07"), "isn't a multiple"),
-        (("convoy", "--controller", "zero"), "only where every agent acts"),
         (("swap:agents=4", "--controller", "filtre"), "did you mean 'filter'"),
     ],
 )
 def test_mistakes_are_said(options, message):
     assert message in " ".join(khop("deploy", *options, status=2).stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"environment": "leader_following_v0"}, "leader_following_v0 moves drifter_0"),
+        ({"arguments": {"network": "ideal", "actuator": "lag"}}, r"acts through Lag\(time_constant=0.1\)"),
+    ],
+)
+def test_environments_that_processes_cannot_play(arguments, message):
+    """Leaders that the task moves, and actuators with a memory of their own."""
+    chosen = {"arguments": {"network": "ideal"}, **arguments}
+    with pytest.raises(ValueError, match=message):
+        steps_of(policy_run("zero", scenario("paper"), "estimate", 1.0, 0, **chosen), 0.05)

@@ -146,12 +146,14 @@ def test_nodes_equal_the_batch(name: str, estimator: str) -> None:
             simulator.step(h)
         t, memory = float(simulator.t[0]), simulator.state.memory
         rounds.update(t, simulator.x[0], u)
-        found = rounds.estimates(t)
+        found, information = rounds.estimates(t), simulator.observers.information(simulator.state)
         for (a, i), at in design.knowledge.slot.items():
-            estimate, certified, _ = found[a][fleet.ids[i]]
+            estimate, certified, *of_messages = found[a][fleet.ids[i]]
             here = slice(at, at + len(estimate))
             np.testing.assert_allclose(estimate, memory["estimate"][here, 0], rtol=0, atol=1e-12)
             np.testing.assert_allclose(certified, memory["bound"][here, 0], rtol=1e-12, atol=1e-12)
+            pair = design.knowledge.column_pair[at]
+            np.testing.assert_allclose(of_messages, [each[pair, 0] for each in information], rtol=1e-12, atol=1e-12)
 
 
 # -- messages as they come -----------------------------------------------------------------------------------------
