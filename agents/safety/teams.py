@@ -16,6 +16,7 @@ from agents.safety.columns import (
     require_model,
     rounding_of,
     tracking_of,
+    warn_of_near_starts,
 )
 from agents.safety.ships import ship_axes
 from agents.safety.stopping import NUMBERS
@@ -183,6 +184,8 @@ def read_team(env: EnvDescription, margin: Margin, radius: float | None) -> Team
     own_columns, own_limits = map(np.array, zip(*own, strict=True))
     radius_column, obstacle = map(np.array, zip(*ofbodies, strict=True))
     pair, pair_limit, widened, distances = map(np.array, zip(*pairs, strict=True))
+    if certified:
+        warn_of_near_starts(env, distances, radius)
     every = list(numbers.values())
     return Team(
         np.array([each.kind for each in every]),
