@@ -242,7 +242,7 @@ def tracking_of(agent: str, env: EnvDescription) -> FloatArray:
     if not (1.01 * (found + rounding_of(agent, env)) + drift * period <= speed * period).all():
         raise ValueError(
             f"{agent!r} can't hold its place: it is pushed at up to {pushed.max() + drift:g} m/s, and its inputs are "
-            f"limited to {speed.min():g} m/s"
+            f"limited to {speed.min():g} m/s: choose a smaller disturbance, or faster agents"
         )
     return found
 
