@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -36,6 +37,8 @@ class EnvDescription:
         message_size: entries at the end of each agent's action that are sent with its messages.
         shielded: whether a safety filter corrects the actions.
         steps: Euler steps of the simulator in a control period; 0 if it integrates otherwise.
+        apart: distance in m from which two acting agents start; None where that isn't known.
+        radius: of agents' bodies in m, where the scenario or the task has one; else None.
     """
 
     environment: str
@@ -50,6 +53,8 @@ class EnvDescription:
     message_size: int = 0
     shielded: bool = False
     steps: int = 1
+    apart: float | None = None
+    radius: float | None = None
 
     __repr__ = brief
 
@@ -92,6 +97,8 @@ def describe(env: object) -> EnvDescription:
     batched = batched_of(env)
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
     disturbance = batched.simulator.disturbance
+    initial = batched.world.initial
+    arena = getattr(batched.task, "arena", None if initial is None else initial.arena)
     pushed = np.zeros(fleet.n) if disturbance is None else disturbance.attach(fleet).bound
     return EnvDescription(
         environment=batched.task.environment,
@@ -105,6 +112,8 @@ def describe(env: object) -> EnvDescription:
         disturbance={agent: pushed[fleet.state_slice(fleet.agent(agent))] for agent in batched.agents},
         message_size=batched.settings.message_size,
         steps=_euler_steps(batched),
+        apart=_apart(batched),
+        radius=None if arena is None else arena.radius,
     )
 
 
@@ -113,6 +122,19 @@ def _euler_steps(batched: BatchedEnv) -> int:
     if settings.order != 1 and not simulator.observers.by_messages:
         return 0
     return settings.substeps * simulator.parts_of(settings.control_period / settings.substeps)
+
+
+def _apart(batched: BatchedEnv) -> float | None:
+    """By the boxes in which they start, or the scenario's arena if it asks for more."""
+    initial = batched.world.initial
+    if initial is None:
+        return None
+    places = batched.fleet.position_index[[batched.fleet.agent(agent) for agent in batched.agents]]
+    center, half = initial.center[places], initial.radius[places]  # (N, d)
+    gaps = np.maximum(np.abs(center[:, None] - center) - (half[:, None] + half), 0.0)
+    first, second = np.triu_indices(len(places), 1)
+    nearest = float(np.linalg.norm(gaps[first, second], axis=1).min(initial=math.inf))
+    return nearest if initial.arena is None else max(nearest, initial.arena.apart)
 
 
 def policy_seeds(seeds: Sequence[int]) -> list[int]:

@@ -6,6 +6,7 @@ docs/theory_safety.md has the theorem, and where each margin comes from.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Collection
 from dataclasses import replace
 
@@ -89,6 +90,8 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
     position, position_limit, bounds, bound_limit, valid_column, widened, distances = map(
         np.array, zip(*pairs, strict=True)
     )
+    if certified:
+        warn_of_near_starts(env, distances, radius)
     speed = np.array([env.models[agent].input_limit for agent in env.agents], float)
     anchors, ages, age_limit, pace_of_other = (
         map(np.array, zip(*announced, strict=True))
@@ -120,6 +123,26 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
         limits[0],
         np.array([pace[agent] for agent in env.agents]),
         pace_of_other,
+    )
+
+
+def warn_of_near_starts(env: EnvDescription, apart: FloatArray, radius: float | None) -> None:
+    """Warn where agents may start closer than the theorem assumes, and so may collide.
+
+    Args:
+        env: the environment.
+        apart: (P,) of `Columns`.
+        radius: of an agent's body in m; None for what the description says.
+    """
+    radius = env.radius if radius is None else radius
+    if radius is None or env.apart is None or env.apart >= 2.0 * radius + float(apart.max()):
+        return
+    warnings.warn(
+        f"the safety filter keeps agents {2.0 * radius + float(apart.max()):.3g} m apart (bodies of {radius:g} m, and "
+        f"what disturbances do in a control period of {env.control_period:g} s), and in {env.scenario} they may start "
+        f"{env.apart:.3g} m apart, and then collide: choose a shorter control period or a smaller disturbance, or let "
+        "them start farther apart",
+        stacklevel=1,  # this line, so that it is said once
     )
 
 
@@ -219,7 +242,7 @@ def tracking_of(agent: str, env: EnvDescription) -> FloatArray:
     if not (1.01 * (found + rounding_of(agent, env)) + drift * period <= speed * period).all():
         raise ValueError(
             f"{agent!r} can't hold its place: it is pushed at up to {pushed.max() + drift:g} m/s, and its inputs are "
-            f"limited to {speed.min():g} m/s"
+            f"limited to {speed.min():g} m/s: choose a smaller disturbance, or faster agents"
         )
     return found
 

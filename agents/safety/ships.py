@@ -26,6 +26,7 @@ class ShipAxes(NamedTuple):
         numbers: (SHIP_NUMBERS,) of `Team.ship`.
         speed: largest speed of the anchor, in m/s.
         pull: largest acceleration along any direction beside that of the damping, in m/s^2.
+        cause: where `pushed` comes from, and what makes it smaller, in words.
     """
 
     damping: float
@@ -35,6 +36,7 @@ class ShipAxes(NamedTuple):
     numbers: FloatArray
     speed: float
     pull: float
+    cause: str
 
     def require_held(self, agent: str, speed_error: FloatArray) -> None:
         """Refuse a ship whose velocity may be farther from its anchor's than was supposed.
@@ -45,7 +47,7 @@ class ShipAxes(NamedTuple):
         if float(np.hypot(*speed_error)) > ERROR * self.speed:
             raise ValueError(
                 f"{agent!r} can't hold its course: disturbances change its velocity by up to {speed_error.max():.2g} "
-                f"m/s, and its speed is limited to {self.speed:.2g} m/s"
+                f"m/s, more than {100 * ERROR:g} % of its speed limit of {self.speed:.2g} m/s; {self.cause}"
             )
 
 
@@ -100,7 +102,8 @@ def _within(
     changed += float(np.abs(turned).max()) * speed * min(yaw_rate * span, 2.0 * yaw)
     euler = step * turning * (0.5 * turning * speed + rate) + disturbance[2] * speed
     seen = rounding * (slope + 2.0 * float(np.abs(turned).max()) * speed) + 2e-7 * force
-    along = float(np.hypot(*disturbance[3:5])) + changed + euler + seen
+    parts = float(np.hypot(*disturbance[3:5])), changed, euler
+    along = parts[0] + changed + euler + seen
     acceleration = float((limit[:2] - beside).min()) / math.sqrt(2.0)
     if not acceleration > 0.0:
         return (
@@ -110,15 +113,37 @@ def _within(
     slowed = step * (linear[2] + quadratic[2] * yaw) / m3
     keep = (1.0 - step * linear[2] / m3) ** steps
     gain = sum(step * (1.0 - step * linear[2] / m3) ** k for k in range(steps))
-    swing = abs(munk) * min(speed**2, 1.5 * speed * rate * span) + disturbance[5] + quadratic[2] * yaw**2 / m3
+    speeding = abs(munk) * min(speed**2, 1.5 * speed * rate * span)
+    swing = speeding + disturbance[5] + quadratic[2] * yaw**2 / m3
     left = yaw - 1.001 * gain * (swing + abs(munk) * 2.0 * speed * rounding) - rounding
     if slowed >= 1.0 or keep * yaw + gain * (abs(munk) * speed**2 / 2.0 - limit[2]) > left:
-        return f"its moment doesn't keep its yaw rate below {yaw:g} rad/s at {speed:.2g} m/s"
+        why = f"its moment doesn't keep its yaw rate below {yaw:g} rad/s at {speed:.2g} m/s"
+        spare = limit[2] + (1.0 - keep) / gain * yaw - abs(munk) * speed**2 / 2.0 - quadratic[2] * yaw**2 / m3
+        if slowed >= 1.0 or spare <= 0.0:
+            return why
+        return f"{why}; {_cause((float(disturbance[5]), speeding, 0.0), 'rad/s^2', disturbance[5], period, steps)}"
     seen_yaw = 1.01 * yaw + rounding
     numbers = np.array([*slowing, *drag, *turned, munk, keep, gain, left, 1.01 * speed + 2.0 * rounding, seen_yaw])
     assert len(numbers) == SHIP_NUMBERS
     pushed = np.array([*disturbance[:2], along, along])
-    return ShipAxes(damping, acceleration, limit, pushed, numbers, anchor, force)
+    cause = _cause(parts, "m/s^2", float(disturbance[3:5].max()), period, steps)
+    return ShipAxes(damping, acceleration, limit, pushed, numbers, anchor, force, cause)
+
+
+def _cause(parts: tuple[float, float, float], unit: str, disturbance: float, period: float, steps: int) -> str:
+    """What a ship has to be held against, and what makes the largest part smaller."""
+    of_disturbance, of_period, of_step = parts
+    known = (
+        (of_disturbance, f"from disturbances of {disturbance:g}", "choose a smaller disturbance"),
+        (of_period, f"from what changes in a control period of {period:.3g} s", "choose a shorter control period"),
+        (
+            of_step,
+            f"from steps of {period / steps:.3g} s",
+            "choose a shorter dt" if steps > 1 else "choose a shorter control period",  # dt would shift it there
+        ),
+    )
+    said = ", ".join(f"{part:.2g} {unit} {where}" for part, where, _ in known if part > 0.0)
+    return f"it has to be held against {said}: {max(known)[2]}"
 
 
 def _settled(force: FloatArray, linear: FloatArray, quadratic: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from agents.safety.columns import (
     require_model,
     rounding_of,
     tracking_of,
+    warn_of_near_starts,
 )
 from agents.safety.ships import ship_axes
 from agents.safety.stopping import NUMBERS
@@ -99,7 +100,7 @@ class _Agent:
         names = ("own.vx", "own.vy") if self.kind == CART else ("own.surge", "own.sway")
         speeds = np.array([layout.high[layout.index(name)] for name in names], float)
         self.speed_rounding = FLOAT32 * speeds
-        accelerations = self.limit[:2]
+        accelerations, cause = self.limit[:2], "choose a smaller disturbance, or larger input limits"
         if isinstance(model, SurfaceVessel):
             yaw = float(layout.high[layout.index("own.yaw_rate")])
             rounding = FLOAT32 * max(float(speeds.max()), yaw)
@@ -108,7 +109,7 @@ class _Agent:
                 2, FLOAT32 * (2.0 * float(speeds.max()) + 4.0)
             )  # turned, by a rounded heading
             damping, accelerations, self.limit = ship.damping, np.full(2, ship.acceleration), ship.limit
-            pull = ship.pull
+            pull, cause = ship.pull, ship.cause
             self.ship, self.fastest, pushed, speeds = ship.numbers, ship.speed, ship.pushed, np.full(2, ship.speed)
         else:
             assert isinstance(model, DoubleIntegrator)
@@ -121,8 +122,8 @@ class _Agent:
             strength = limit - 1.01 * tracking.budget
             if not strength > 0.0:
                 raise ValueError(
-                    f"{agent!r} can't hold its place: against disturbances of up to {pushed[2 + c]:.3g} m/s^2 it "
-                    f"needs {tracking.budget:.3g} m/s^2, and its inputs give {limit:.3g} m/s^2"
+                    f"{agent!r} can't hold its place: against up to {pushed[2 + c]:.3g} m/s^2 it "
+                    f"needs {tracking.budget:.3g} m/s^2, and its inputs give {limit:.3g} m/s^2; {cause}"
                 )
             self.pull = max(self.pull, 1.01 * (pull + tracking.budget))
             turning = env.control_period if steps > 1 else 0.0
@@ -183,6 +184,8 @@ def read_team(env: EnvDescription, margin: Margin, radius: float | None) -> Team
     own_columns, own_limits = map(np.array, zip(*own, strict=True))
     radius_column, obstacle = map(np.array, zip(*ofbodies, strict=True))
     pair, pair_limit, widened, distances = map(np.array, zip(*pairs, strict=True))
+    if certified:
+        warn_of_near_starts(env, distances, radius)
     every = list(numbers.values())
     return Team(
         np.array([each.kind for each in every]),

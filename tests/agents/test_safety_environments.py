@@ -1,5 +1,6 @@
 """The safety filter in environments: episodes over a network, the policy inside, and what is refused."""
 
+import dataclasses
 import itertools
 
 import networkx as nx
@@ -172,6 +173,30 @@ def test_what_the_theorem_does_not_cover_is_refused(arguments, scenario, options
     policy = shielded("tanh", **options)
     with pytest.raises(ValueError, match=message):
         policy.reset(describe(make_batched(Bodies(), scenario, **arguments)), [0])
+
+
+@pytest.mark.parametrize("scenario", ["swap:agents=4", "crossing:agents=4", "corridor:agents=4", CIRCLE])
+def test_agents_start_as_far_apart_as_described(scenario):
+    """Never nearer, and not much farther: by the arena, or the boxes in which they start."""
+    env = make_batched("navigation_v0", scenario, num_envs=400)
+    env.reset(0)
+    places = env.world.positions()
+    first, second = np.triu_indices(len(places), 1)
+    nearest = np.linalg.norm(places[first] - places[second], axis=1).min()
+    assert nearest >= describe(env).apart > 0.8 * nearest
+
+
+@pytest.mark.parametrize(("model", "distance"), [("integrator", "1.67"), ("cart", "1.07")])
+def test_starts_nearer_than_the_theorem_assumes_are_warned_of(model, distance):
+    """With both distances; they can collide from there. Only where something is certified."""
+    chosen = f"crossing:disturbance=0.9,model={model},agents=4"
+    env = describe(make_batched("navigation_v0", chosen, control_period=0.5, bounds=True))
+    with pytest.warns(UserWarning, match=rf"keeps agents {distance} m apart \(bodies of 0.2 m.* may start 1 m apart"):
+        make_policy("filter").reset(env, [0])
+    make_policy("filter:margin=none").reset(env, [0])
+    make_policy("filter").reset(dataclasses.replace(env, apart=None), [0])
+    make_policy("filter").reset(dataclasses.replace(env, apart=1.7), [0])
+    make_policy("filter").reset(describe(make_batched("navigation_v0", f"crossing:model={model}", bounds=True)), [0])
 
 
 def test_bodies_of_unknown_size_are_refused():

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from agents import SafetyFilter, compare
+from agents import SafetyFilter, compare, describe, shielded
 from agents.safety.braking import axis_map, brake_table, held, track
 from agents.safety.ships import ship_axes
 from agents.safety.stopping import (
@@ -22,6 +22,7 @@ from agents.safety.stopping import (
 )
 from khop_env.env.layout import ObservationLayout
 from khop_env.physics import DriftingIntegrator, SingleIntegrator, SurfaceVessel, Unicycle
+from khop_env.registry import make_batched
 from tests.agents.ramming_models import Ram, RammingTeam, cart, ship
 
 TEAMS = {
@@ -274,16 +275,35 @@ def test_what_the_theorem_does_not_cover_is_refused():
     slim = RammingTeam([weak] * 4).description()
     for env, message in (
         (dataclasses.replace(unicycles, disturbance=pushed), "'unicycle_0' aside, at up to 0.1 m/s: let it act on the"),
-        (dataclasses.replace(carts, disturbance=strong), "'cart_0' can't hold its place: against disturbances of up"),
+        (
+            dataclasses.replace(carts, disturbance=strong),
+            "'cart_0' can't hold its place: against up to .* choose a smaller",
+        ),
         (dataclasses.replace(carts, disturbance={}), "nothing of the disturbance of 'cart_0'"),
         (dataclasses.replace(carts, steps=0), "needs a simulator of order 1, whose steps 'cart_0' follows"),
         (ships, "can't hold 'vessel_0': at .* m/s drag and turning take up to"),
-        (slim, "can't hold 'vessel_0': its moment doesn't keep its yaw rate below"),
+        (slim, "can't hold 'vessel_0': its moment doesn't keep its yaw rate below 0.3 rad/s at 1.1 m/s$"),
     ):
         with pytest.raises(ValueError, match=message):
             SafetyFilter(Ram(RammingTeam([cart()] * 4))).reset(env, [0])
     for env in (dataclasses.replace(unicycles, disturbance=pushed), dataclasses.replace(carts, steps=0)):
         SafetyFilter(Ram(RammingTeam([cart()] * 4)), 0.3).reset(env, [0])
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "arguments", "message"),
+    [
+        (0.1, {"control_period": 0.1}, r"its place.* 0\.1, 0\.3 m/s\^2 .* period of 0\.1 s.*a shorter control period$"),
+        (0.1, {"control_period": 0.1, "dt": 0.02}, r"its moment .* period of 0\.1 s: choose a shorter control period$"),
+        (0.3, {}, r"its course: .*0\.42 m/s\^2 from disturbances of 0\.3, .*: choose a smaller disturbance$"),
+    ],
+)
+def test_ships_that_cannot_be_held_are_refused_with_the_cause(disturbance, arguments, message):
+    """And what the message says to change helps."""
+    env = make_batched("navigation_v0", f"swap:model=vessel,disturbance={disturbance}", bounds=True, **arguments)
+    with pytest.raises(ValueError, match=message):
+        shielded("zero").reset(describe(env), [0])
+    shielded("zero").reset(describe(make_batched("navigation_v0", "swap:model=vessel", bounds=True)), [0])
 
 
 @pytest.mark.parametrize("model", ["integrator", "drifter", "cart", "unicycle", "vessel"])
