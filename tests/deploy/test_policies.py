@@ -89,13 +89,13 @@ def test_a_process_gets_its_own_part_of_the_task_only():
 
 def test_an_action_that_is_none_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(
+    (tmp_path / "late_policy.py").write_text(
         "import numpy as np\nclass Late:\n"
         "    def reset(self, env, seeds): self.agents, self.calls = env.agents, 0\n"
         "    def act(self, observations):\n        self.calls += 1\n"
         "        return {agent: np.full(2, np.nan if self.calls > 2 else 0.5) for agent in self.agents}\n"
     )
-    played = policy_run("mine.py:Late", scenario("swap:agents=4"), "estimate", 1.0, 0)
+    played = policy_run("late_policy.py:Late", scenario("swap:agents=4"), "estimate", 1.0, 0)
     chosen = scenario("swap:agents=4")
     with Team(chosen, played, tmp_path, rounds=9, policies=policy_setups(played, 0)) as team:
         team.advance(in_step=True)
