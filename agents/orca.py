@@ -124,7 +124,7 @@ def bodies_of(env: EnvDescription) -> tuple[IntArray, IntArray]:
     for agent, layout in env.layouts.items():
         found.append(bodies(agent, env, start, None))
         start += len(layout)
-    return np.array([radius for radius, _ in found]), np.array([obstacles for _, obstacles in found])
+    return np.array([radius for radius, _, _ in found]), np.array([obstacles for _, obstacles, _ in found])
 
 
 @compiled

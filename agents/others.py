@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.policy import EnvDescription, Observations
 from agents.velocity_law import VELOCITY_INPUTS
@@ -17,6 +19,15 @@ from khop_env.physics import AgentModel, DriftingIntegrator
 
 HELD = ("integrator", "unicycle")  # types of agents whose last position is held until another arrives
 NEWER = 1e-3  # s: a stamp later by less is the same one
+
+_REMEMBERED = {
+    "now": "_now",
+    "velocity": "velocity",
+    "ahead": "ahead",
+    "place": "_place",
+    "stamp": "_stamp",
+    "time": "_time",
+}
 
 
 class Others:
@@ -90,6 +101,21 @@ class Others:
         moved = flat.copy()
         moved[:, self.position] += self.ahead.astype(np.float32)
         return moved
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """A copy of what `update` remembers."""
+        return {name: np.copy(getattr(self, attribute)) for name, attribute in _REMEMBERED.items()}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from `get_state()`'s result, of the same environment and batch."""
+        for name, attribute in _REMEMBERED.items():
+            setattr(self, attribute, state[name].copy())
+        self._now = float(state["now"])
+
+    def begin(self, batch: int) -> None:
+        """Episodes of a batch begin: nothing is known."""
+        self._now = 0.0
+        self._allocate(batch)
 
     def _allocate(self, batch: int) -> None:
         pairs = len(self.valid)

@@ -44,7 +44,7 @@ the list is padded to the longest; a slot that isn't in use is all zeros.
 | own.input.<input>           | own input in force, as a fraction of its limit; not with actuator="direct"        |
 | own.type.<type>             | one-hot of the agent's type; uniform only                                         |
 | goal.x, .y                  | its goal, relative to this agent, in m                                            |
-| obstacle0.x, .y ...         | nearest points of the up to 3 nearest obstacles, relative to this agent, in m     |
+| obstacle0.x, .y ...         | nearest points of all obstacles, relative to this agent, in m; the nearest first  |
 | radius                      | of every agent's disc, in m                                                       |
 | slot0.valid                 | 1 if the slot is in use                                                           |
 | slot0.heard                 | 1 if the agent is a neighbour, 0 if it is estimated                               |

@@ -86,7 +86,7 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
     if not pairs:
         raise ValueError(f"{env.environment} on {env.scenario} has no slots: nobody knows of anybody")
     columns, limits, tracked = map(np.array, zip(*own, strict=True))
-    radius_column, obstacle = map(np.array, zip(*ofbodies, strict=True))
+    radius_column, obstacle, obstacle_limit = map(np.array, zip(*ofbodies, strict=True))
     position, position_limit, bounds, bound_limit, valid_column, widened, distances = map(
         np.array, zip(*pairs, strict=True)
     )
@@ -113,6 +113,7 @@ def read_columns(env: EnvDescription, margin: Margin, radius: float | None, anno
         math.nan if radius is None else radius,
         distances,
         obstacle,
+        obstacle_limit,
         np.array([rounding_of(agent, env) for agent in env.agents]),
         np.array([np.linalg.norm(tracking[agent]) for agent in env.agents]),
         speed,
@@ -183,8 +184,8 @@ def _own(agent: str, env: EnvDescription) -> IntArray:
     return np.array([env.layouts[agent].index(f"own.{axis}") for axis in env.models[agent].position])
 
 
-def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -> tuple[int, IntArray]:
-    """The column of the bodies' radius, -1 if it is given, and (M, 2) those of obstacles' nearest points.
+def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) -> tuple[int, IntArray, FloatArray]:
+    """The column of the bodies' radius, -1 if it is given, (M, 2) those of obstacles' nearest points, and their limits.
 
     Args:
         agent: the observing agent's id.
@@ -206,8 +207,8 @@ def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) ->
             )
         column = start + layout.index("radius")
     count = len({name.partition(".")[0] for name in names if name.startswith("obstacle")})
-    places = [start + layout.columns(f"obstacle{q}") for q in range(count)]
-    return column, np.array(places, np.int64).reshape(-1, 2)
+    places = np.array([layout.columns(f"obstacle{q}") for q in range(count)], np.int64).reshape(-1, 2)
+    return column, start + places, layout.high[places].astype(float)
 
 
 def rounding_of(agent: str, env: EnvDescription) -> FloatArray:
@@ -307,6 +308,11 @@ def require_all_known(agent: str, layout: ObservationLayout, env: EnvDescription
         )
     if layout.slots and not any(_is_bound(name) for name in layout.names):
         raise ValueError("margin='certified' reads certified bounds: make the environment with bounds=True")
+    if not env.steps:
+        raise ValueError(
+            "margin='certified' needs a simulator of order 1, or a network: bounds of estimates, and how agents brake, "
+            "are proven for its steps only; leave order=2 out, or choose a margin of some metres, without a guarantee"
+        )
     others = {slot.id for slot in layout.slots}
     if strangers := sorted(others - set(env.agents)):
         raise ValueError(

@@ -56,8 +56,14 @@ def rows_around(
         near = math.sqrt(x * x + y * y)
         if not near > 0.0:
             return -1
+        sure, limit = near * (1.0 - EPSILON) - team.rounding[i, 0] - team.rounding[i, 1], team.obstacle_limit[i, q]
+        if abs(x) >= limit[0] or abs(y) >= limit[1]:  # clipped: at least as far away, in any direction
+            farthest = math.hypot(max(-box[0], box[1]), max(-box[2], box[3])) + math.hypot(off_x, off_y)
+            if sure - farthest - keep < reach:
+                return -1
+            continue
         x, y = x / near, y / near
-        ahead = near * (1.0 - EPSILON) + x * off_x + y * off_y - team.rounding[i, 0] - team.rounding[i, 1]
+        ahead = sure + x * off_x + y * off_y
         room = ahead - keep - (max(x * box[0], x * box[1]) + max(y * box[2], y * box[3]))
         if room >= reach:
             continue
@@ -97,7 +103,6 @@ def others_box(
     x: FloatArray,
     state: FloatArray,
     known: bool,
-    certified: bool,
     memory: FloatArray,
     box: FloatArray,
 ) -> bool:
@@ -113,8 +118,7 @@ def others_box(
         x: (7,) this agent's state.
         state: (2, 7) overwritten: what counts of the other's state, and its bounds.
         known: whether this agent knows anything of the other.
-        certified: whether what is known of its anchor from before is kept.
-        memory: (8,) that.
+        memory: (8,) that; used while what is observed is old, since all is new when an episode begins.
         box: (4,) written: lower and upper x, lower and upper y.
 
     Returns:
@@ -141,25 +145,31 @@ def others_box(
         turned = min(h[2] + 1e-6, 2.0) * math.hypot(abs(s[4]) + h[4], abs(s[5]) + h[5])
         h[2], h[3] = abs(cos) * h[4] + abs(sin) * h[5] + turned, abs(sin) * h[4] + abs(cos) * h[5] + turned
         s[2], s[3] = cos * s[4] - sin * s[5], sin * s[4] + cos * s[5]
-    most = widen[pair, 4]
+    if columns[pair, 17] < 0 or not seen[columns[pair, 17]] > 0.0:
+        memory[:] = math.nan
+    most, kept = widen[pair, 4], known and memory[0] == memory[0]
     for c in range(2):
         half = h[2 + c] + abs(s[2 + c]) * EPSILON + widen[pair, 2 + c]
         low_v, high_v = max(s[2 + c] - half, -most), min(s[2 + c] + half, most)
         low, high = x[c] + box[2 * c], x[c] + box[2 * c + 1]
+        s[2 + c], h[2 + c], box[2 * c], box[2 * c + 1] = low_v, high_v, low, high
         before, speeds = memory[2 * c : 2 * c + 2], memory[4 + 2 * c : 6 + 2 * c]
-        if certified and before[0] == before[0]:  # where the anchor can have come since
+        if before[0] == before[0]:  # where the anchor can have come since
             push, gain = axes[j, c, PUSH] * widen[pair, 5], axes[j, c, GAIN] * widen[pair, 5]
             before[0] += axes[j, c, FORWARD] * speeds[0] - push - 1e-9
             before[1] += axes[j, c, FORWARD] * speeds[1] + push + 1e-9
             speeds[0] = max(axes[j, c, KEEP] * speeds[0] - gain - 1e-9, -most)
             speeds[1] = min(axes[j, c, KEEP] * speeds[1] + gain + 1e-9, most)
-            if not known:
-                continue
-            if max(low, before[0]) <= min(high, before[1]) and max(low_v, speeds[0]) <= min(high_v, speeds[1]):
-                low, high = max(low, before[0]), min(high, before[1])
-                low_v, high_v = max(low_v, speeds[0]), min(high_v, speeds[1])
-        if not known:
-            continue
+            kept = kept and max(low, before[0]) <= min(high, before[1])
+            kept = kept and max(low_v, speeds[0]) <= min(high_v, speeds[1])
+    if not known:
+        return known
+    for c in range(2):
+        low, high, low_v, high_v = box[2 * c], box[2 * c + 1], s[2 + c], h[2 + c]
+        before, speeds = memory[2 * c : 2 * c + 2], memory[4 + 2 * c : 6 + 2 * c]
+        if kept:
+            low, high = max(low, before[0]), min(high, before[1])
+            low_v, high_v = max(low_v, speeds[0]), min(high_v, speeds[1])
         before[0], before[1], speeds[0], speeds[1] = low, high, low_v, high_v
         box[2 * c] = low - x[c] - stopping_distance(axes, j, c, -low_v)
         box[2 * c + 1] = high - x[c] + stopping_distance(axes, j, c, high_v)

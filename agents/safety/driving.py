@@ -136,7 +136,6 @@ def drive(
                         x,
                         state,
                         valid_now,
-                        team.unknown_stops,
                         memory[b, pair],
                         boxes[k],
                     )

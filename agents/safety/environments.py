@@ -47,6 +47,7 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
         self._inner = env
         self.filter = SafetyFilter(None, margin, **options)
         self.filter.reset(describe(env), [0])
+        self.filter.begin(1)
         self.action_spaces = {
             agent: Box(-1.0, 1.0, (size,), np.float32) for agent, size in self.filter.inside.action_sizes.items()
         }
@@ -134,8 +135,13 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
         inner, remembered = state if isinstance(state, tuple) and len(state) == 2 else (state, None)
         if remembered is None:
             raise TypeError(f"set_state() takes what get_state() of a ShieldedEnv returned; got {type(state).__name__}")
-        self._inner.set_state(inner)
+        before = self.filter.get_state()
         self.filter.set_state(remembered)
+        try:
+            self._inner.set_state(inner)
+        except Exception:
+            self.filter.set_state(before)
+            raise
         self._seen_by_filter = {agent: self._inner.observe(agent) for agent in self._inner.possible_agents}
 
     def _seen(self, observations: dict[str, Float32Array]) -> dict[str, Float32Array]:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.others import Others, side_by_side
 from agents.policy import EnvDescription, Observations, Policy
+from agents.safety.checks import checked, is_number, require_state
 from agents.safety.columns import ANNOUNCED, DRIFT, Margin, read_columns, without_bounds
 from agents.safety.driving import drive
 from agents.safety.moves import filter_moves, periods_of_rest
@@ -99,9 +100,9 @@ class SafetyFilter:
         bounds: bool | None = None,
         dead_reckoning: bool = False,
     ) -> None:
-        if not 0.0 < gamma <= 1.0:
+        if not (is_number(gamma) and 0.0 < gamma <= 1.0):
             raise ValueError(f"gamma must be above 0 and at most 1; got {gamma!r}")
-        if radius is not None and not 0.0 < radius < math.inf:
+        if radius is not None and not (is_number(radius) and 0.0 < radius < math.inf):
             raise ValueError(f"radius must be a positive number of metres; got {radius!r}")
         if policy is None and dead_reckoning:
             raise ValueError(
@@ -119,6 +120,7 @@ class SafetyFilter:
             )
         self.dead_reckoning = bool(dead_reckoning)
         self.radius, self._bounds = radius, bounds
+        self._least_radius = radius if self.margin == "certified" else None
         self.needs_bounds = self.margin == "certified"
         self.wanted: dict[str, Float32Array] = {}
         self.correction: dict[str, FloatArray] = {}
@@ -135,9 +137,9 @@ class SafetyFilter:
         Raises:
             ValueError: if the filter or the policy inside doesn't fit the environment; the message says why.
         """
-        self._env = env
-        self._brakes = any(type(model) not in DRIFT for model in env.models.values())
-        if self._brakes:
+        brakes = any(type(model) not in DRIFT for model in env.models.values())
+        others = _held(env) if self.dead_reckoning else None
+        if brakes:
             if self.announce:
                 raise ValueError("announce=True is for teams of integrators only: leave it out, or choose such a team")
             team = read_team(env, self.margin, self.radius)
@@ -147,7 +149,7 @@ class SafetyFilter:
             columns = read_columns(env, self.margin, self.radius, self.announce)
             self._columns, self._scale = tuple(columns), columns.scale
             self._limit, self._own, self._pairs = columns.speed, columns.own, 0
-        self._others = _held(env) if self.dead_reckoning else None
+        self._env, self._brakes, self._others = env, brakes, others
         models = enumerate(env.models.values())
         self._drifting = {number: model for number, model in models if isinstance(model, DriftingIntegrator)}
         self.begin(0)
@@ -160,12 +162,15 @@ class SafetyFilter:
         """The policy's actions where they are safe, otherwise the nearest safe ones; once in a control period.
 
         Raises:
-            ValueError: if there is no policy inside, it leaves an agent out, or the batch has changed since the reset.
+            ValueError: as `correct`, or if there is no policy inside.
         """
+        self._require_reset()
+        observations = checked(observations, self._env, self._least_radius)
         return self.correct(observations, self.policy.act(self.seen(observations)))
 
     def seen(self, observations: Observations) -> Observations:
         """What the policy inside, or a learner, gets of observations: those that `inside` describes."""
+        self._require_reset()
         if not self._kept:
             return observations
         return {agent: np.asarray(observations[agent])[..., self._kept[agent]] for agent in observations}
@@ -178,25 +183,23 @@ class SafetyFilter:
             actions: (..., m_i) by agent, as `inside` describes them.
 
         Raises:
-            ValueError: if an agent's action is missing or of another shape, or the batch has changed since the reset.
+            ValueError: if an agent's observation or action is missing or of another shape, the batch has changed since
+                the reset, there was none, or with margin="certified" agents are observed to be larger than `radius`.
         """
-        agents, shape = self._env.agents, next(iter(observations.values())).shape[:-1]
-        for agent, layout in self._env.layouts.items():
-            if observations[agent].shape[-1] != len(layout):
-                raise ValueError(
-                    f"the safety filter reads the {len(layout)} columns of {agent!r} in the environment that it was "
-                    f"reset for; it got {observations[agent].shape[-1]}"
-                )
+        self._require_reset()
+        observations = checked(observations, self._env, self._least_radius)
+        agents = self._env.agents
+        shape = observations[agents[0]].shape[:-1]
         self.wanted = {agent: _numbers(agent, action) for agent, action in actions.items()}
         flat = np.ascontiguousarray(side_by_side(observations, agents))
-        if self._others is not None:
-            self._others.update(flat)
-            flat = self._others.extrapolated(flat)
         batch = len(flat)
         if self._started.shape[0] != batch:
             if self._started.size:
                 raise ValueError(f"the batch of observations changed from {len(self._started)} to {batch}: reset first")
             self.begin(batch)
+        if self._others is not None:
+            self._others.update(flat)
+            flat = self._others.extrapolated(flat)
         fractions = np.stack([self._wanted(agent, batch) for agent in agents], axis=1)
         limit, period, drift = self._limit, self._env.control_period, self._drift(flat)
         wanted = np.clip(fractions, -1.0, 1.0, dtype=np.float64) * limit
@@ -235,22 +238,38 @@ class SafetyFilter:
             batch: number of environments.
             env_ids: those in which they have begun; None for all.
         """
+        self._require_reset()
         if env_ids is None:
             shape = batch, len(self._env.agents)
             self._anchor, self._started = np.zeros((*shape, 4 if self._brakes else 2)), np.zeros(shape, np.bool_)
             self._resting = np.zeros(shape, np.int64)
             self._memory = np.full((batch, self._pairs, 8), np.nan)
+            if self._others is not None:
+                self._others.begin(batch)
         elif len(self._started):
             self._started[env_ids], self._resting[env_ids], self._memory[env_ids] = False, 0, np.nan
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """A copy of what the filter remembers between actions."""
-        return {name: getattr(self, f"_{name}").copy() for name in _REMEMBERED}
+        """A copy of what the filter remembers between actions; not of what the policy inside does."""
+        self._require_reset()
+        state = {name: getattr(self, f"_{name}").copy() for name in _REMEMBERED}
+        return state if self._others is None else state | self._others.get_state()
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from `get_state()`'s result, after a reset in the same environment."""
+        """Continue from `get_state()`'s result, after a reset in the same environment.
+
+        Raises:
+            ValueError: if it is of another team, batch or kind of filter; nothing has changed then.
+        """
+        require_state(state, self.get_state())
         for name in _REMEMBERED:
             setattr(self, f"_{name}", state[name].copy())
+        if self._others is not None:
+            self._others.set_state(state)
+
+    def _require_reset(self) -> None:
+        if not hasattr(self, "_env"):
+            raise ValueError("the safety filter knows no environment yet: call reset(describe(env), seeds) first")
 
     def _wanted(self, agent: str, batch: int) -> Float32Array:
         """(B, M) what the policy inside wants of an agent, with zeros after its inputs."""

@@ -41,6 +41,7 @@ class Columns(NamedTuple):
         body: radius in m.
         apart: (P,) distance that the anchors have to keep, less two radii.
         obstacle: (N, M, 2) columns of the vectors to the nearest points of static convex obstacles.
+        obstacle_limit: (N, M, 2) as `own_limit`.
         rounding: (N, 2) of observed positions.
         off: (N,) largest distance from the anchor by the theory.
         speed: (N, 2) input limits in m/s.
@@ -68,6 +69,7 @@ class Columns(NamedTuple):
     body: float
     apart: FloatArray
     obstacle: IntArray
+    obstacle_limit: FloatArray
     rounding: FloatArray
     off: FloatArray
     speed: FloatArray
@@ -163,9 +165,16 @@ def filter_moves(
                 if near == 0.0 or turn >= 0.5 * math.pi:
                     used = -1
                     break
+                keep = radius + columns.off[i] + SLACK
+                sure = near * (1.0 - EPSILON) - columns.rounding[i, 0] - columns.rounding[i, 1]
+                limit = columns.obstacle_limit[i, q]
+                if abs(x) >= limit[0] or abs(y) >= limit[1]:  # clipped: at least as far away, in any direction
+                    if sure - math.hypot(off_x, off_y) - keep < reach:
+                        used = -1
+                        break
+                    continue
                 x, y = x / near, y / near
-                ahead = near * (1.0 - EPSILON) + x * off_x + y * off_y - columns.rounding[i, 0] - columns.rounding[i, 1]
-                used = obstacle_rows(x, y, ahead, radius + columns.off[i] + SLACK, turn, reach, rows, used)
+                used = obstacle_rows(x, y, sure + x * off_x + y * off_y, keep, turn, reach, rows, used)
             for pair in range(columns.first[i], columns.first[i + 1]):
                 if used < 0:
                     break

@@ -24,9 +24,10 @@ class Team(NamedTuple):
         own: (N, 7) columns of its state.
         own_limit: (N, 7) values from here on may have been clipped.
         first: (N + 1,) the agent's first pair.
-        pair: (P, 17) columns of the other's state (7), positions relative, and of its bounds (7), that of the heading
+        pair: (P, 18) columns of the other's state (7), positions relative, and of its bounds (7), that of the heading
             in the place of the cosine's and -1 where none is read; of the flag that something is known, -1 where the
-            bound says all; the other agent, -1 for one that doesn't act and is taken as standing; its kind.
+            bound says all; the other agent, -1 for one that doesn't act and is taken as standing; its kind; the
+            column of the age of what is observed, -1 where nothing from before is kept.
         pair_limit: (P, 14) as `own_limit`.
         unknown_stops: whether an agent of which nothing is known stops this one, instead of being left out.
         widen: (P, 6) half widths that are added to the bounds of position (2) and velocity (2); the other's `fastest`;
@@ -35,6 +36,7 @@ class Team(NamedTuple):
         radius: (N,) column of the radius of the agents' bodies; -1 where it is `body`.
         body: radius in m.
         obstacle: (N, M, 2) columns of the vectors to the nearest points of static convex obstacles.
+        obstacle_limit: (N, M, 2) as `own_limit`.
         rounding: (N, 2) of observed positions.
         off: (N,) largest distance from the anchor at any time.
         tracking: (N, 4) largest observed errors of position and velocity at the beginning of a period.
@@ -57,6 +59,7 @@ class Team(NamedTuple):
     radius: IntArray
     body: float
     obstacle: IntArray
+    obstacle_limit: FloatArray
     rounding: FloatArray
     off: FloatArray
     tracking: FloatArray

@@ -94,8 +94,6 @@ class _Agent:
     def _brake(self, agent: str, env: EnvDescription, margin: Margin, pushed: FloatArray) -> None:
         """A cart or a ship: hold it near its anchor, and stop the anchor with what is left of the input."""
         model, steps, layout = env.models[agent], env.steps, env.layouts[agent]
-        if not steps and margin == "certified":
-            raise ValueError(f"margin='certified' needs a simulator of order 1, whose steps {agent!r} follows")
         steps = steps or _CONTINUOUS
         names = ("own.vx", "own.vy") if self.kind == CART else ("own.surge", "own.sway")
         speeds = np.array([layout.high[layout.index(name)] for name in names], float)
@@ -173,7 +171,8 @@ def read_team(env: EnvDescription, margin: Margin, radius: float | None) -> Team
             bounds, bound_limits = _look_up(layout, names, start)
             by_messages = f"{name}.age" in layout.names  # then boxes are right before anything has arrived, too
             valid = -1 if certified and by_messages else start + layout.index(f"{name}.valid")
-            columns = np.array([*columns, *bounds, valid, order.get(slot.id, -1), other.kind])
+            age = start + layout.index(f"{name}.age") if certified and by_messages else -1
+            columns = np.array([*columns, *bounds, valid, order.get(slot.id, -1), other.kind, age])
             widen = np.array([*(constant + other.error + of.rounding), *other.speed_error, other.fastest, other.pull])
             apart = float(np.linalg.norm(of.within) + np.linalg.norm(other.within))
             pairs.append((columns, np.concatenate([limits, bound_limits]), widen, apart))
@@ -182,7 +181,7 @@ def read_team(env: EnvDescription, margin: Margin, radius: float | None) -> Team
     if not pairs:
         raise ValueError(f"{env.environment} on {env.scenario} has no slots: nobody knows of anybody")
     own_columns, own_limits = map(np.array, zip(*own, strict=True))
-    radius_column, obstacle = map(np.array, zip(*ofbodies, strict=True))
+    radius_column, obstacle, obstacle_limit = map(np.array, zip(*ofbodies, strict=True))
     pair, pair_limit, widened, distances = map(np.array, zip(*pairs, strict=True))
     if certified:
         warn_of_near_starts(env, distances, radius)
@@ -200,6 +199,7 @@ def read_team(env: EnvDescription, margin: Margin, radius: float | None) -> Team
         radius_column,
         math.nan if radius is None else radius,
         obstacle,
+        obstacle_limit,
         np.array([each.rounding for each in every]),
         np.array([np.linalg.norm(each.within) for each in every]),
         np.array([each.observed_error for each in every]),

@@ -16,7 +16,6 @@ from khop_env.tasks.base import Column, MapCanvas, Outcome, Signature, Task, Wor
 from khop_env.tasks.edges import NUMBER, Reward, axis_names, require_positive
 from khop_env.tasks.motion import add_squares, lower_distances
 
-MOST_OBSTACLES = 3  # in an observation
 START = np.array([0.8, 0.5])  # of an arrow in the legend
 RING = np.column_stack([np.cos(np.linspace(0.0, 2.0 * np.pi, 49)), np.sin(np.linspace(0.0, 2.0 * np.pi, 49))])
 DISC, COLLIDED, OBSTACLE, ARROW, MARKED = "#8899aa", "#cc3311", "#999999", "#ee7733", "#aa3377"
@@ -101,17 +100,13 @@ class Navigation(Task):
         self._input_owner = np.repeat(np.arange(len(fleet)), [model.m for model in fleet.models])
 
     def columns(self, world: World, agent: int) -> Sequence[Column]:
-        """Goal and the nearest points of the nearest obstacles, relative to the agent, and the agents' radius."""
+        """Goal and nearest points of all obstacles, relative to the agent, the nearest first; the agents' radius."""
         axes, unit = axis_names(world.fleet.position_dim), world.fleet.position_unit()
         names = [f"goal.{axis}" for axis in axes]
-        names += [f"obstacle{q}.{axis}" for q in range(self._observed) for axis in axes]
+        names += [f"obstacle{q}.{axis}" for q in range(len(self._obstacles)) for axis in axes]
         reach, first = 2.0 * world.limit, agent * len(names)
         columns = [Column(name, unit, -reach, reach, row=first + q) for q, name in enumerate(names)]
         return [*columns, Column("radius", unit, 0.0, max(world.limit, self.arena.radius), self.arena.radius)]
-
-    @property
-    def _observed(self) -> int:
-        return min(MOST_OBSTACLES, len(self._obstacles))
 
     def observe(self, world: World, out: FloatArray) -> None:
         """Fill these columns."""
@@ -119,9 +114,9 @@ class Navigation(Task):
         agents, dim, batch = positions.shape
         rows = out.reshape(agents, -1, batch)
         rows[:, :dim] = self.memory["goal"] - positions
-        if self._observed:
+        if len(self._obstacles):
             gaps = self._to_obstacles(positions)
-            order = np.argsort(np.hypot(gaps[:, 0], gaps[:, 1]), axis=1, kind="stable")[:, None, : self._observed]
+            order = np.argsort(np.hypot(gaps[:, 0], gaps[:, 1]), axis=1, kind="stable")[:, None]
             nearest = np.take_along_axis(gaps, order, axis=2).swapaxes(1, 2)
             rows[:, dim:] = nearest.reshape(agents, -1, batch)
 

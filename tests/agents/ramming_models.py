@@ -116,7 +116,8 @@ class RammingTeam:
                 size = scale * self.rng.random((self.batch, model.n)) * self.rng.integers(0, 2, (self.batch, 1))
                 estimate = true + size * self.rng.choice([-1.0, 1.0], size.shape)
                 known = np.maximum(size - self.missing * (np.arange(model.n) < 2), 0.0)
-                values |= {f"{name}.valid": 1.0} | ({f"{name}.age": 0.0} if f"{name}.age" in layout.names else {})
+                values |= {f"{name}.valid": 1.0}
+                values |= {f"{name}.age": self.period} if f"{name}.age" in layout.names else {}  # old: memory counts
                 seen = _seen(model, estimate)
                 relative = estimate[:, :2] - self.x[i][:, :2]
                 values |= {f"{name}.position.{axis}": relative[:, c] for c, axis in enumerate("xy")}
