@@ -169,5 +169,6 @@ def test_a_simulator_of_order_2_is_refused():
         env = describe(make_batched("navigation_v0", text, order=2, bounds=True))
         with pytest.raises(ValueError, match=r"needs a simulator of order 1, or a network.* leave order=2 out"):
             shielded("zero").reset(env, [0])
-        shielded("zero", 0.3).reset(env, [0])
+        if model == "integrator":  # carts: `test_safety_models.py`
+            shielded("zero", 0.3).reset(env, [0])
         shielded("zero").reset(describe(make_batched("navigation_v0", text, bounds=True)), [0])
