@@ -291,6 +291,22 @@ def require_model(
         )
 
 
+def require_steps(env: EnvDescription) -> None:
+    """Refuse simulators whose steps aren't those that bounds and braking are proven for.
+
+    Args:
+        env: the environment.
+
+    Raises:
+        ValueError: for a simulator of order 2 without a network.
+    """
+    if not env.steps:
+        raise ValueError(
+            "margin='certified' needs a simulator of order 1, or a network: bounds of estimates, and how agents brake, "
+            "are proven for its steps only; leave order=2 out, or choose a margin of some metres, without a guarantee"
+        )
+
+
 def require_all_known(agent: str, layout: ObservationLayout, env: EnvDescription) -> None:
     """Refuse what the theorem doesn't cover.
 
@@ -308,11 +324,7 @@ def require_all_known(agent: str, layout: ObservationLayout, env: EnvDescription
         )
     if layout.slots and not any(_is_bound(name) for name in layout.names):
         raise ValueError("margin='certified' reads certified bounds: make the environment with bounds=True")
-    if not env.steps:
-        raise ValueError(
-            "margin='certified' needs a simulator of order 1, or a network: bounds of estimates, and how agents brake, "
-            "are proven for its steps only; leave order=2 out, or choose a margin of some metres, without a guarantee"
-        )
+    require_steps(env)
     others = {slot.id for slot in layout.slots}
     if strangers := sorted(others - set(env.agents)):
         raise ValueError(

@@ -14,6 +14,7 @@ from agents.safety.columns import (
     bodies,
     require_all_known,
     require_model,
+    require_steps,
     rounding_of,
     tracking_of,
     warn_of_near_starts,
@@ -94,6 +95,8 @@ class _Agent:
     def _brake(self, agent: str, env: EnvDescription, margin: Margin, pushed: FloatArray) -> None:
         """A cart or a ship: hold it near its anchor, and stop the anchor with what is left of the input."""
         model, steps, layout = env.models[agent], env.steps, env.layouts[agent]
+        if margin == "certified":
+            require_steps(env)
         steps = steps or _CONTINUOUS
         names = ("own.vx", "own.vy") if self.kind == CART else ("own.surge", "own.sway")
         speeds = np.array([layout.high[layout.index(name)] for name in names], float)
