@@ -245,8 +245,8 @@ class _Player:
     def environment(self, observe: Observe, needed: Needs, network: str | None) -> BatchedEnv:
         """The environment, with num_envs = CHUNK, and what a policy needs unless the arguments say otherwise."""
         if (observe, needed, network) not in self._made:
-            arguments = needed.among(self._arguments)
-            arguments = arguments if network is None else {**arguments, "network": network}
+            arguments = self._arguments if network is None else {**self._arguments, "network": network}
+            arguments = needed.among(arguments, self._scenario)
             env = make_batched(self._environment, self._scenario, num_envs=CHUNK, observe=observe, **arguments)
             self._made[observe, needed, network] = env
         return self._made[observe, needed, network]

@@ -14,9 +14,11 @@ from agents.policy import Policy
 from agents.robust_barrier import RobustBarrier
 from agents.safety import Margin, SafetyFilter
 from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
+from khop_env.network import Network
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
 from khop_env.registry import environments, parameters_from_text
+from khop_env.scenarios import Scenario
 
 FLOOR: dict[str, Callable[..., Policy]] = {
     "zero": ZeroPolicy,
@@ -137,8 +139,23 @@ class Needs(NamedTuple):
     bounds: bool
     message_size: int
 
-    def among(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """These, and then `arguments`, which come first where they say otherwise."""
+    def among(self, arguments: Mapping[str, Any], scenario: Scenario | None = None) -> dict[str, Any]:
+        """These, and then `arguments`, which come first where they say otherwise.
+
+        Args:
+            arguments: of the environment.
+            scenario: None where its network isn't to be checked.
+
+        Raises:
+            ValueError: if a filter announces anchors where there are no messages.
+        """
+        chosen = arguments.get("network")
+        network = chosen if chosen is not None or scenario is None else scenario.network
+        if self.message_size and scenario is not None and Network.of(network) is None:
+            raise ValueError(
+                "announce=true sends anchors in messages, and without a network there are none: leave it out, or "
+                "choose a network, e.g. network='wifi'"
+            )
         needed: dict[str, Any] = {"bounds": True} if self.bounds else {}
         return needed | ({"message_size": self.message_size} if self.message_size else {}) | dict(arguments)
 

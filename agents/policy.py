@@ -15,6 +15,7 @@ from khop_env.env.layout import Float32Array
 from khop_env.observers import FloatArray
 from khop_env.physics import AgentModel
 from khop_env.simulation import Observe
+from khop_env.tasks import Navigation
 
 Observations = Mapping[str, Float32Array]
 """(..., D_i) by agent: a single observation, or a batch with one row per environment."""
@@ -38,7 +39,7 @@ class EnvDescription:
         shielded: whether a safety filter corrects the actions.
         steps: Euler steps of the simulator in a control period; 0 if it integrates otherwise.
         apart: distance in m from which two acting agents start; None where that isn't known.
-        radius: of agents' bodies in m, where the scenario or the task has one; else None.
+        radius: of agents' bodies in m, in navigation and where the scenario has an arena; else None.
     """
 
     environment: str
@@ -98,7 +99,9 @@ def describe(env: object) -> EnvDescription:
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
     disturbance = batched.simulator.disturbance
     initial = batched.world.initial
-    arena = getattr(batched.task, "arena", None if initial is None else initial.arena)
+    arena = None if initial is None else initial.arena
+    if isinstance(batched.task, Navigation):  # which has one on every scenario
+        arena = batched.task.arena
     pushed = np.zeros(fleet.n) if disturbance is None else disturbance.attach(fleet).bound
     return EnvDescription(
         environment=batched.task.environment,

@@ -16,6 +16,7 @@ from agents.outcomes import Outcomes
 from agents.policies import make_policy, needs
 from agents.policy import Policy, describe, policy_seeds
 from agents.safety import SafetyFilter
+from agents.safety.environments import show_corrections
 from khop_env.env import KHopEnv, Settings
 from khop_env.objects import described
 from khop_env.observers import Extremes, FloatArray, FunnelError, SolveError
@@ -23,9 +24,6 @@ from khop_env.registry import Environment, environments, find_task, make
 from khop_env.results.recording import Drawing, StoppedError
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe, Simulator
-
-ARROW_TIME = 0.5  # s: frames show a filter's correction of a velocity as the way of this time,
-ARROW_LENGTH = 0.75  # m: at most so long
 
 
 class PolicyRun:
@@ -95,12 +93,7 @@ class PolicyRun:
             StoppedError: if the policy fails, or its actions are refused.
         """
         actions: Mapping[str, Any] = self._guarded(self.policy.act, self._observations)
-        if correction := getattr(self.policy, "correction", None):  # a filter's, by agent in m/s, for frames
-            arrows = ARROW_TIME * np.stack(list(correction.values()))[..., None]
-            length = np.linalg.norm(arrows, axis=1, keepdims=True)
-            self.env.batched.world.arrows = arrows / np.maximum(length / ARROW_LENGTH, 1.0)
-        if infeasible := getattr(self.policy, "infeasible", None):
-            self.env.batched.world.marked = np.stack(list(infeasible.values()))[:, None]
+        show_corrections(self.env.batched.world, self.policy)
         self._observations, rewards, *_ = self._guarded(self.env.step, actions)
         self.episode_return += float(np.mean(list(rewards.values())))
         self._cycle += 1
@@ -186,7 +179,7 @@ def policy_and_environment(
     about = _training(policy, named, scenario)
     if about.get("environment") == named:
         chosen = {"bounds": about["bounds"], **about.get("arguments", {}), **chosen}
-    chosen |= needs(policy).among(arguments or {})
+    chosen |= needs(policy).among(arguments or {}, scenario)
     if duration is not None:
         if "max_cycles" in (arguments or {}):
             raise ValueError("a duration and max_cycles: choose one of them for the length of the episode")

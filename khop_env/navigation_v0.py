@@ -28,8 +28,10 @@ What it holds is an estimate with a certified bound on its error, which grows wi
 All take the same parameters, e.g. `swap:agents=16,speed=1,radius=0.2,model=cart,graph=ring,loss=0.3,burst=5`; with
 `continuous=true` exchange is in continuous time, and the bounds are the paper's. Defaults: 8 single integrators up to
 1 m/s on the paper's tree, k = 6, discs of 0.2 m, a disturbance of 0.1 m/s, 30 % of messages lost in bursts of 5, 15 s.
-Hard: `agents=16,duration=30`. Any other scenario works, too: agents of 0.2 m go to random goals within its initial set,
-where they may touch at the start.
+**Hard: `swap:agents=16,duration=30`** (or `crossing:`, `corridor:`), 16 agents for 30 s.
+
+Any other scenario works, too: agents of 0.2 m go to random goals within its initial set, where they may touch at the
+start; a certified filter then warns that they may.
 
 ### Observation Space
 

@@ -87,6 +87,23 @@ def test_every_policy_of_an_evaluation_is_shielded(folder):
         (("run", *PLAYED, "--shield", "certified", "--env", "bounds=false"), "with bounds=True"),
         (("train", *PLAYED, "--shield", "safe"), "margin must be 'certified', 'none' or a number of metres"),
         (("train", *PLAYED, "--shield", "certified,gama=1"), "no option 'gama'; did you mean 'gamma'?"),
+        (("run", *PLAYED, "--shield", "certified,gama=1"), "--shield: 'certified,gama=1': no option 'gama'; did you"),
+        (
+            ("evaluate", *PLAYED, "--policies", "zero,filter:tanh", "--shield", "0.3"),
+            "--shield 0.3: 'filter:tanh' is in a safety filter already: leave one of them out",
+        ),
+        (
+            ("evaluate", *PLAYED, "--policies", "filter:announce=true:zero", "--network", "none"),
+            "announce=true sends anchors in messages, and without a network there are none",
+        ),
+        (
+            ("run", *PLAYED, "--shield", "certified,announce=true", "--network", "none"),
+            "announce=true sends anchors in messages, and without a network there are none",
+        ),
+        (
+            ("train", *PLAYED, "--shield", "certified,announce=true", "--network", "none"),
+            "announce=true sends anchors in messages, and without a network there are none",
+        ),
         (("train", *PLAYED, "--from", "nowhere"), "can't begin from nowhere: no policy file nowhere"),
     ],
 )

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
+from agents.evaluation import chosen_scenario
 from agents.learning.config import TrainingConfig
 from agents.learning.scaling import MOST, ObservationScaler
 from agents.learning.shielded import ShieldedSB3VecEnv
@@ -36,7 +37,8 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
     arguments: dict[str, Any] = {"bounds": config.bounds, **config.arguments}
     if config.shield is not None:  # the learner doesn't get what the filter needs
         needed = needs(safety_filter(str(config.shield), None))
-        arguments = needed.among(config.arguments) | {"bounds": config.bounds or needed.bounds}
+        scenario = chosen_scenario(config.environment, config.scenario)
+        arguments = needed.among(config.arguments, scenario) | {"bounds": config.bounds or needed.bounds}
     return make_batched(config.environment, **where, num_envs=count, observe=config.observe, **arguments)
 
 

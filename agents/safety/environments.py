@@ -10,14 +10,19 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
-from agents.policy import describe
+from agents.policy import batched_of, describe
 from agents.safety.columns import Margin
 from agents.safety.filter import SafetyFilter
-from khop_env.env import EnvState, KHopEnv, ObservationLayout
+from khop_env.env import CostsApart, EnvState, KHopEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
+from khop_env.tasks import World
 
 Infos = dict[str, dict[str, Any]]
 ShieldedState = tuple[EnvState, dict[str, NDArray[Any]]]
+
+
+ARROW_TIME = 0.5  # s: frames show a filter's correction of a velocity as the way of this time,
+ARROW_LENGTH = 0.75  # m: at most so long
 
 
 class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
@@ -28,21 +33,23 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
 
     Observations are without bounds unless `bounds=True`: the filter needs them, a learner hardly does. Infos have two
     more keys, "intervention", the length of the correction in m/s, and "infeasible"; `SafetyFilter` explains both, and
-    does the same to a policy's actions.
+    does the same to a policy's actions. Frames have arrows and rings for them.
 
     Args:
         env: made with bounds=True for margin="certified", and with message_size=4 for announce=True.
         margin: of the filter.
-        options: of `SafetyFilter`: gamma, announce, radius, bounds.
+        options: of `SafetyFilter`: gamma, announce, radius, bounds; not dead_reckoning, which needs a policy inside.
 
     Attributes:
         filter: the safety filter.
 
     Raises:
+        TypeError: if `env` is no ParallelEnv of khop_env, or returns costs apart: CostsApart goes around a ShieldedEnv.
         ValueError: if the filter doesn't fit the environment, or an option is out of range.
     """
 
     def __init__(self, env: KHopEnv, margin: Margin = "certified", **options: Any) -> None:
+        _require_parallel(env)
         super().__init__(env)
         self._inner = env
         self.filter = SafetyFilter(None, margin, **options)
@@ -61,6 +68,10 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
             "a ShieldedEnv isn't for functions that step the environment inside, such as evaluate(): give them "
             f"env.unwrapped and the policy shielded(policy, {self.filter.margin!r}); env.filter.inside describes it"
         )
+
+    @property
+    def _world(self) -> World:
+        return batched_of(self._inner).world
 
     def observation_space(self, agent: str) -> Box:
         """The same object at every call."""
@@ -83,6 +94,7 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
         """Start a new episode, as the environment inside."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self.filter.begin(1)
+        self._world.arrows = self._world.marked = None
         nothing = {"intervention": 0.0, "infeasible": False}
         return self._seen(observations), {agent: {**info, **nothing} for agent, info in infos.items()}
 
@@ -98,13 +110,16 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
             TypeError: as the environment inside; nothing has changed then.
             ValueError: likewise.
         """
-        remembered = self.filter.get_state()
+        remembered, world = self.filter.get_state(), self._world
+        shown = world.arrows, world.marked
         try:
             if isinstance(actions, Mapping) and self.agents:
                 actions = {**actions, **self.filter.correct(self._seen_by_filter, actions)}
+                show_corrections(world, self.filter)
             observations, rewards, terminations, truncations, infos = self.env.step(actions)
         except Exception:
             self.filter.set_state(remembered)
+            world.arrows, world.marked = shown
             raise
         found = self.filter
         described: Infos = {
@@ -142,11 +157,48 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
         except Exception:
             self.filter.set_state(before)
             raise
+        self._world.arrows = self._world.marked = None
         self._seen_by_filter = {agent: self._inner.observe(agent) for agent in self._inner.possible_agents}
 
     def _seen(self, observations: dict[str, Float32Array]) -> dict[str, Float32Array]:
         self._seen_by_filter = observations
         return dict(self.filter.seen(observations))
+
+
+def show_corrections(world: World, policy: object) -> None:
+    """Frames get arrows for what a safety filter changed, and rings where its guarantee had to be begun anew.
+
+    Args:
+        world: of the environment, of B environments.
+        policy: the filter, or any policy with its attributes `correction` and `infeasible`; nothing is shown of others.
+    """
+    if correction := getattr(policy, "correction", None):
+        arrows = ARROW_TIME * np.stack([np.atleast_2d(each).T for each in correction.values()])  # (N, 2, B)
+        length = np.linalg.norm(arrows, axis=1, keepdims=True)
+        world.arrows = arrows / np.maximum(length / ARROW_LENGTH, 1.0)
+    if infeasible := getattr(policy, "infeasible", None):
+        world.marked = np.stack([np.atleast_1d(each) for each in infeasible.values()])
+
+
+def _require_parallel(env: object) -> None:
+    """Refuse what a ShieldedEnv can't step.
+
+    Raises:
+        TypeError: naming what it is, and what to do.
+    """
+    inner = env
+    while isinstance(inner, BaseParallelWrapper):
+        if isinstance(inner, CostsApart):
+            raise TypeError("costs come apart last: CostsApart(ShieldedEnv(env)), not ShieldedEnv(CostsApart(env))")
+        if isinstance(inner, ShieldedEnv):
+            raise TypeError("the environment is a ShieldedEnv already; give all options to one")
+        inner = inner.env
+    if not isinstance(inner, KHopEnv):
+        raise TypeError(
+            "a ShieldedEnv is around a ParallelEnv of khop_env, e.g. navigation_v0.parallel_env(bounds=True); got "
+            f"{type(env).__name__}. Batches: SafetyFilter(None, ...).correct(observations, actions), or "
+            "ShieldedSB3VecEnv for Stable-Baselines3"
+        )
 
 
 def space_of(layout: ObservationLayout) -> Box:

@@ -86,7 +86,7 @@ class SafetyFilter:
             show, which then stops. It is never True while the theorem's assumptions hold.
 
     Raises:
-        ValueError: for a margin, gamma or radius out of range, or anchors that aren't needed.
+        ValueError: for a margin, gamma or radius out of range, anchors that aren't needed, or a filter as the policy.
     """
 
     def __init__(
@@ -107,6 +107,10 @@ class SafetyFilter:
         if policy is None and dead_reckoning:
             raise ValueError(
                 "dead_reckoning=True is for a filter with a policy, which it begins anew with every episode"
+            )
+        if isinstance(policy, SafetyFilter):
+            raise ValueError(
+                "the policy is in a safety filter already, which another would undo: leave one of them out"
             )
         self.policy: Policy = _NoPolicy() if policy is None else policy
         self.margin, self.gamma = as_margin(margin), float(gamma)

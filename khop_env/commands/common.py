@@ -138,18 +138,20 @@ def shielded_name(policy: str, shield: str | None) -> str:
     """A policy's name in a safety filter, as `agents.make_policy` reads it; unchanged without `--shield`.
 
     Raises:
-        ValueError: for an unknown margin.
+        ValueError: for an unknown margin or option, or a policy that is in a filter already.
     """
     if shield is None:
         return policy
-    from agents.policies import FILTER
-    from agents.safety import as_margin
+    from agents.policies import FILTER, safety_filter
+    from agents.scripted import ZeroPolicy
 
     margin, comma, options = shield.partition(",")
     try:
-        as_margin(margin)
+        safety_filter(shield, ZeroPolicy())
     except ValueError as error:
-        raise ValueError(f"--shield: {error}") from None
+        raise ValueError(f"--shield: {str(error).removeprefix('shield ')}") from None
+    if policy.partition(":")[0] == FILTER:
+        raise ValueError(f"--shield {shield}: {policy!r} is in a safety filter already: leave one of them out")
     return f"{FILTER}:{policy}" if shield == "certified" else f"{FILTER}:margin={margin}{comma}{options}:{policy}"
 
 

@@ -252,7 +252,7 @@ def _rate(rate: float, interval: list[float]) -> str:
 def _name(row: Row, comparison: Comparison) -> str:
     """Policy, mode, and the number of episodes if some are missing."""
     count = len(row.episodes.seed)
-    few = "" if count == comparison.planned else f" ({count} episodes)"
+    few = "" if count == comparison.planned else f"\n({count} episodes)"
     return f"{folded(row.policy)} on {row.observe}{few}"
 
 

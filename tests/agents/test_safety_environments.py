@@ -234,6 +234,8 @@ def test_policies_by_name():
         ("filter:gamma=x", "gamma must be of type float; got 'x'"),
         ("filter:gamma=2", "gamma must be above 0 and at most 1"),
         ("filter:tan", "did you mean 'tanh'"),
+        ("filter:filter", "policy 'filter:filter': the policy is in a safety filter already"),
+        ("filter:gamma=0.5:filter:margin=none:zero", "the policy is in a safety filter already"),
     ):
         with pytest.raises(ValueError, match=message):
             make_policy(spec)

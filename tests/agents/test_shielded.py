@@ -14,6 +14,7 @@ from agents.learning.shielded import ShieldedSB3VecEnv
 from agents.learning.training import train
 from agents.policy import by_agent
 from khop_env import make_sb3_vec, navigation_v0
+from khop_env.env import CostsApart
 from khop_env.env.sb3 import KHopSB3VecEnv
 from khop_env.registry import make_batched
 
@@ -168,6 +169,52 @@ def test_refused_actions_change_nothing():
         env.filter.correct({agent: env.observe(agent) for agent in env.agents}, fine)
     with pytest.raises(ValueError, match="make the environment with bounds=True"):
         parallel(bounds=False)
+
+
+def test_frames_show_what_the_filter_changes():
+    """As those of `khop run` do; not any more after a reset, and as before where actions are refused."""
+    env, learner = parallel(max_cycles=100, render_mode="rgb_array"), make_policy("go_to_goal")
+    observations, _ = env.reset(3)
+    learner.reset(env.filter.inside, [0])
+    world, first = env.unwrapped.batched.world, env.render()
+    for _ in range(30):
+        observations, *_ = env.step(learner.act(observations))
+    correction = np.stack([env.filter.correction[agent] for agent in env.possible_agents])
+    lengths = np.linalg.norm(world.arrows[..., 0], axis=1)
+    np.testing.assert_allclose(lengths, np.minimum(0.5 * np.linalg.norm(correction, axis=1), 0.75))
+    assert lengths.max() > 0.1
+    assert world.marked.shape == (8, 1)
+    frame, shown = env.render(), world.arrows
+    with pytest.raises(ValueError, match="isn't finite"):
+        env.step({agent: np.full(2, np.nan) for agent in env.agents})
+    assert world.arrows is shown
+    world.arrows = world.marked = None
+    assert not np.array_equal(frame, env.render())
+    env.step(learner.act(observations))
+    assert world.arrows is not None
+    env.reset(3)
+    assert world.arrows is world.marked is None
+    np.testing.assert_array_equal(env.render(), first)
+
+
+def test_what_a_shielded_environment_cannot_step_is_refused():
+    """When it is made, with what to do; costs come apart around it."""
+    env = navigation_v0.parallel_env(bounds=True, max_cycles=30)
+    for wrong, message in (
+        (CostsApart(env), r"CostsApart\(ShieldedEnv\(env\)\), not ShieldedEnv\(CostsApart\(env\)\)"),
+        (ShieldedEnv(env), "is a ShieldedEnv already"),
+        (CostsApart(ShieldedEnv(env)), "costs come apart last"),
+        (make_batched("navigation_v0", bounds=True), r"got BatchedEnv. Batches: SafetyFilter\(None, ...\).correct"),
+        (navigation_v0.env(bounds=True), "around a ParallelEnv of khop_env"),
+        (None, "got NoneType"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            ShieldedEnv(wrong)
+    apart = CostsApart(ShieldedEnv(env))
+    apart.reset(3)
+    assert len(apart.step(dict.fromkeys(apart.agents, np.zeros(2, np.float32)))) == 6
+    with pytest.raises(ValueError, match="in a safety filter already"):
+        shielded(shielded("zero"))
 
 
 @pytest.mark.parametrize("shield", ["certified", None])
