@@ -189,7 +189,7 @@ def print_comparison(comparison: Comparison) -> None:
     guarantee = "bound (of all observers, below 1 by guarantee)"
     if networked:
         guarantee = "certified bound (at most 1 by guarantee)"
-    print_table(header, rows, title, whole=header[:1])
+    print_table(header, rows, title)
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
         "mean over agents and episodes, at the end; settled: median time from which the team's mean task error stays "
