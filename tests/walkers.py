@@ -252,7 +252,11 @@ FAULTS = {
         r".* at their lower bound: state\(\) is outside its Box: entry \d is -4\..* -4.0 and 4.0",
     ),
     InfiniteReward: ("spaces", r"call 1, step\(\): the reward of 'walker_0' must be a finite number; got -inf"),
-    Shaken: ("same_seed", r"call 0, reset\(\): observations\['walker_0'\]\[0\]: -?0\.\d+, then -?0\.\d+$"),
+    # which entries differ is up to chance: some are rounded to the same number
+    Shaken: (
+        "same_seed",
+        r"call \d+, \w+\(\): observations\['walker_\d'\]\[[01]\]: -?\d\.\d+(e-\d+)?, then -?\d\.\d+(e-\d+)?$",
+    ),
     Globally: ("global_random", r"call 1, step\(\) moves NumPy's global generator"),
     DeafToSeeds: ("other_seed", r"seeds 0 and 1 give the same 20 steps"),
     BornSeeded: ("unseeded", r"two environments that were never seeded play the same 20 steps"),
