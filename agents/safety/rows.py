@@ -45,12 +45,7 @@ def box_rows(
         return used
     if nearest == 0.0:
         return -1
-    low, high = 0.0, 0.0  # angles of the corners, from the direction of the nearest point
-    for corner in range(4):
-        cx = x + (hx if corner & 1 else -hx)
-        cy = y + (hy if corner & 2 else -hy)
-        angle = math.atan2(near_x * cy - near_y * cx, near_x * cx + near_y * cy)
-        low, high = min(low, angle), max(high, angle)
+    low, high = corner_angles(x, y, hx, hy, near_x, near_y)
     sectors = max(1, math.ceil((high - low) / SECTOR))
     step = (high - low) / sectors
     shrink = 0.5 * gamma * math.cos(0.5 * step)
@@ -78,6 +73,18 @@ def box_rows(
         rows[used, 2] = before
         used += 1
     return used
+
+
+@compiled
+def corner_angles(x: float, y: float, hx: float, hy: float, near_x: float, near_y: float) -> tuple[float, float]:
+    """Smallest and largest angle of a box's corners, seen from the origin, from the direction of a point of it."""
+    low, high = 0.0, 0.0
+    for corner in range(4):
+        cx = x + (hx if corner & 1 else -hx)
+        cy = y + (hy if corner & 2 else -hy)
+        angle = math.atan2(near_x * cy - near_y * cx, near_x * cx + near_y * cy)
+        low, high = min(low, angle), max(high, angle)
+    return low, high
 
 
 @compiled

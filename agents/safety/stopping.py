@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from agents.safety.rows import TOLERANCE, ray_distance
+from agents.safety.rows import TOLERANCE, corner_angles, ray_distance
 from khop_env.compiled import compiled
 from khop_env.observers import FloatArray
 
@@ -104,12 +104,7 @@ def separating_rows(
         return used
     if not nearest > 0.0:
         return -1
-    low, high = 0.0, 0.0  # angles of the corners, from the direction of the nearest point
-    for corner in range(4):
-        cx = x + (hx if corner & 1 else -hx)
-        cy = y + (hy if corner & 2 else -hy)
-        angle = math.atan2(near_x * cy - near_y * cx, near_x * cx + near_y * cy)
-        low, high = min(low, angle), max(high, angle)
+    low, high = corner_angles(x, y, hx, hy, near_x, near_y)
     middle = math.atan2(near_y, near_x) / STEP
     begin, end = math.floor(middle + low / STEP - 1e-9), math.ceil(middle + high / STEP + 1e-9)
     sector = min(max(math.floor(middle), begin), end - 1)  # holds the nearest point, between its rays and the next

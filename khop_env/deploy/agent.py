@@ -41,7 +41,7 @@ _POLL = 2e-4  # s
 
 
 class Agent:
-    """An agent that runs when it is told to.
+    """An agent whose rounds are run one by one from outside.
 
     Args:
         setup: what it has to know.
