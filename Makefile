@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test quick lint bench integrations clean
+.PHONY: demo test quick lint docs docs-open bench integrations clean
 
 demo: .venv/core
 	$(BIN)/khop run paper
@@ -17,6 +17,13 @@ lint: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: .venv/docs
+	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
+	@echo 'docs/_build/html/index.html'
+
+docs-open: docs
+	$(BIN)/python -m http.server --bind 127.0.0.1 --directory docs/_build/html 8000
 
 # PEERS=1 installs what environments are compared with, each in an environment of its own (gigabytes, minutes)
 bench: .venv/bench $(if $(PEERS),.peers/mpe2/done .peers/vmas/done .peers/jaxmarl/done)
@@ -50,6 +57,6 @@ clean:
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
 	touch $@
 
-.venv/test .venv/bench .venv/dev: .venv/%: .venv/core pyproject.toml constraints.txt
+.venv/test .venv/bench .venv/dev .venv/docs: .venv/%: .venv/core pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[$*]'
 	touch $@

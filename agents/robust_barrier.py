@@ -37,7 +37,7 @@ class RobustBarrier(KeepRight):
 
     It isn't always solvable: surrounded by others, or by large bounds, an agent can't retreat from all. It then takes
     the velocity at which the largest violation is smallest, within its input limits and what obstacles leave: it
-    retreats as well as it can. So it has no guarantee, and collides where losses come in bursts (docs/theory_safety.md,
+    retreats as well as it can. So it has no guarantee, and collides where losses come in bursts (docs/theory/safety.md,
     "Not this"). For agents whose input is a velocity.
 
     Args:

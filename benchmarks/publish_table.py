@@ -1,4 +1,4 @@
-"""Train, measure and write docs/learning.md, docs/learning.png and the shipped policies: one to two hours on two cores.
+"""Train, measure, write docs/benchmarks/learning.md, its figure and the shipped policies: 1 to 2 hours on two cores.
 
     .venv/bin/python -m benchmarks.publish_table
 
@@ -54,17 +54,18 @@ def main() -> None:
         "are centred. The script `leader_following` does so on neighbours only, and a network can learn it; in plain "
         "consensus estimates aren't decisive. They are where an agent follows a moving reference that isn't its "
         "neighbour.\n",
-        "![Learning curves](learning.png)\n",
+        "![Learning curves](../images/learning.png)\n",
     ]
     for block in blocks:
         text += table(block)
-    options.docs.mkdir(parents=True, exist_ok=True)
-    page = options.docs / "learning.md"
+    page, figure = options.docs / "benchmarks" / "learning.md", options.docs / "images" / "learning.png"
+    for path in (page, figure):
+        path.parent.mkdir(parents=True, exist_ok=True)
     written = page.read_text(encoding="utf-8") if page.exists() else ""
     by_hand = "".join(written.partition("\n## ")[1:])  # sections of this level stay
     page.write_text("\n".join(text).rstrip() + "\n" + by_hand, encoding="utf-8")
     curves = {block.task.label: (block.timesteps, block.curves) for block in blocks}
-    learning_curves(curves, options.docs / "learning.png")
+    learning_curves(curves, figure)
     PRETRAINED.mkdir(exist_ok=True)
     for task in TASKS:
         name = describe(make_batched(task.environment, task.scenario)).scenario

@@ -1,6 +1,6 @@
 """Film an episode twice, side by side: the same filter on point estimates, and on estimates with certified bounds.
 
-python -m benchmarks.safety_film docs/safety.gif         # or .mp4
+python -m benchmarks.safety_film docs/images/safety.gif         # or .mp4
 """
 
 from __future__ import annotations

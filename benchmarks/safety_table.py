@@ -1,4 +1,4 @@
-"""The table of docs/safety.md: ways to keep apart, over networks.
+"""The table of docs/benchmarks/safety.md: ways to keep apart, over networks.
 
 python -m benchmarks.safety_table crossing swap:agents=16,duration=30 --episodes 200 --workers 2
 """

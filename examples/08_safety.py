@@ -1,6 +1,7 @@
 """Keeping apart from agents that nobody hears: the same filter on point estimates, and on estimates with bounds.
 
-Messages are lost in bursts, so that what agents know of each other may be old. docs/safety.md says what is certain.
+Messages are lost in bursts, so that what agents know of each other may be old. docs/benchmarks/safety.md says what is
+certain.
 """
 
 from agents import compare

@@ -1,7 +1,7 @@
 """One process per robot, datagrams between them; one robot is killed, and comes back while the others go on.
 
-`khop deploy` on the command line, and here what its tables say about that robot. docs/robots.md tells what to replace
-for robots of your own.
+`khop deploy` on the command line, and here what its tables say about that robot. docs/guides/robots.md tells what to
+replace for robots of your own.
 """
 
 import json

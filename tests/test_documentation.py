@@ -136,7 +136,7 @@ def test_methods_explain_their_arguments(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda page: page.name
 )
 def test_pages_have_no_placeholders(page):
     found = re.findall(r"@[A-Z]+@", page.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""A safety filter round any policy, with certified estimates (docs/theory_safety.md)."""
+"""A safety filter round any policy, with certified estimates (docs/theory/safety.md)."""
 
 from agents.safety.columns import Margin
 from agents.safety.environments import ShieldedEnv

@@ -1,4 +1,4 @@
-"""How agents that have to brake come to rest: the numbers of docs/theory_safety.md, "Agents that have to brake".
+"""How agents that have to brake come to rest: the numbers of docs/theory/safety.md, "Agents that have to brake".
 
 Along each axis of the world an agent is held near an anchor, which moves without a disturbance: p' = v, v' = -damping v
 + u in the simulator's own steps, with inputs held over a period.

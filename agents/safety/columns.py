@@ -1,6 +1,6 @@
 """Tables of the columns that a safety filter reads, and checks of what its theorem assumes.
 
-docs/theory_safety.md has the theorem, and where each margin comes from.
+docs/theory/safety.md has the theorem, and where each margin comes from.
 """
 
 from __future__ import annotations

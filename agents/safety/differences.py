@@ -1,6 +1,6 @@
 """Compiled: boxes of all differences of two agents' stopping boxes that are possible, and the rows they give.
 
-docs/theory_safety.md, "Agents that have to brake", has the theorem. Lengths are in m.
+docs/theory/safety.md, "Agents that have to brake", has the theorem. Lengths are in m.
 """
 
 from __future__ import annotations

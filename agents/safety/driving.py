@@ -1,6 +1,6 @@
 """Compiled loop of the safety filter for teams with agents that have to brake: carts, unicycles and ships.
 
-docs/theory_safety.md, "Agents that have to brake", has the theorem. Lengths are in m.
+docs/theory/safety.md, "Agents that have to brake", has the theorem. Lengths are in m.
 """
 
 from __future__ import annotations

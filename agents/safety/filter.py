@@ -1,6 +1,6 @@
 """A safety filter around any policy: the inputs nearest to the policy's that keep all agents apart.
 
-docs/theory_safety.md has the theorem, its assumptions, and what is measured only.
+docs/theory/safety.md has the theorem, its assumptions, and what is measured only.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class SafetyFilter:
     brought it without a disturbance. Agents have to be the library's own models in the plane, whose inputs are their
     actions (actuator="direct"); teams may mix them. Integrators move to the nearest admitted place; unicycles, and
     carts and ships, which have to brake, always keep a way to stop. With margin="certified" the distance is kept
-    whatever the network does, provided that all agents run the filter and start apart (docs/theory_safety.md); with
+    whatever the network does, provided that all agents run the filter and start apart (docs/theory/safety.md); with
     other margins it is not.
 
     Args:

@@ -1,6 +1,6 @@
 """Compiled loop of the safety filter over environments, agents and slots.
 
-docs/theory_safety.md has the program. Lengths are in m, moves are of one control period.
+docs/theory/safety.md has the program. Lengths are in m, moves are of one control period.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Compiled program of the safety filter: rows that keep a move away from boxes and obstacles, and the nearest move.
 
-docs/theory_safety.md has the program and why its rows imply it. Lengths are in m, moves are of one control period.
+docs/theory/safety.md has the program and why its rows imply it. Lengths are in m, moves are of one control period.
 """
 
 from __future__ import annotations

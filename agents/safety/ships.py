@@ -1,4 +1,4 @@
-"""Ships as carts: what their turning and drag add to the disturbance. docs/theory_safety.md, "Ships"."""
+"""Ships as carts: what their turning and drag add to the disturbance. docs/theory/safety.md, "Ships"."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Compiled geometry of stopping boxes: where an agent comes to rest, and rows that keep such boxes apart.
 
-docs/theory_safety.md, "Agents that have to brake", has the theorem. Boxes are relative to the agent's anchor, in m.
+docs/theory/safety.md, "Agents that have to brake", has the theorem. Boxes are relative to the agent's anchor, in m.
 """
 
 from __future__ import annotations

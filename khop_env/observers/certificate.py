@@ -5,7 +5,7 @@
     estimate = box.clip(estimate)
     bound = box.far_face(estimate)
 
-Theory and proofs: docs/theory_certificates.md.
+Theory and proofs: docs/theory/certificates.md.
 """
 
 from __future__ import annotations

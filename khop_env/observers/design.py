@@ -4,7 +4,7 @@ Disagreements and errors of the observers of target i obey xi = M_i x_tilde. Wit
 component, all its eta_i observers get one funnel, by one of two rules:
 
     "paper":  rho_i(t) = lambda_min(M_i) / sqrt(eta_i) delta_i(t)   (Problem 2: |rho_i| <= lambda_min(M_i) delta_i)
-    "sharp":  rho_i(t) = delta_i(t) / max_a [M_i^-1 1]_a            (the widest: docs/theory_graphs.md)
+    "sharp":  rho_i(t) = delta_i(t) / max_a [M_i^-1 1]_a            (the widest: docs/theory/graphs.md)
 
 Either way M_i^-1 >= 0 entry by entry, so that |xi| < rho_i bounds the error of each observer a by its own number
 

@@ -2,7 +2,7 @@
 
 Every period each agent broadcasts one message: the time, its own state, and for every agent up to k hops away that it
 has heard of the freshest state that has reached it, with its age. So states are stored and forwarded, predicted by the
-models in the meantime, and each lies in a box that the age alone certifies (docs/theory_certificates.md). An estimator
+models in the meantime, and each lies in a box that the age alone certifies (docs/theory/certificates.md). An estimator
 adds what it wants to send, and estimates inside the boxes.
 """
 

@@ -37,7 +37,7 @@ class ObserverNode:
 
     With the estimator "relay" it keeps and passes on the freshest state of each and predicts it with f; "ppso" runs the
     paper's state and input observers by implicit steps, one a round, on what was heard last. Both report estimates
-    within the certified box (docs/theory_certificates.md), agents at one hop included.
+    within the certified box (docs/theory/certificates.md), agents at one hop included.
 
     A round begins with every `update`, or with `step`, as soon as the next multiple of the period has come. It ends
     with `estimates`, or with the next update.

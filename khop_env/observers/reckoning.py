@@ -5,7 +5,7 @@ prediction p+ = p + h f(p) parts from it by at most r, component by component:
 
     r+ = min((I + h Lambda) r, r + h spread) + h (g_bar + w_bar)
 
-wherever -h df_j/dx_j <= 1, which `longest_step` keeps (docs/theory_certificates.md, "Sampled systems").
+wherever -h df_j/dx_j <= 1, which `longest_step` keeps (docs/theory/certificates.md, "Sampled systems").
 """
 
 from __future__ import annotations

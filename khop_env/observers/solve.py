@@ -14,7 +14,7 @@ Written in the impulse z = phi'(e) and with b = P^-1 (M y* - h x_i), s = tau / r
 
 where e(z) is increasing and bounded with slope in (0, 1/4]. Newton's matrix diag(de/dz) + s M is symmetric positive
 definite with M's sparsity, and never singular. Where links go one way M isn't symmetric, but a row-wise diagonally
-dominant M-matrix: there is still exactly one solution (docs/theory_graphs.md), and Newton's matrix is factorised by LU,
+dominant M-matrix: there is still exactly one solution (docs/theory/graphs.md), and Newton's matrix is factorised by LU,
 which needs no pivoting; likewise where links come and go, and M differs between environments. The unknown that is
 carried is eps = T(e): any real number, so no step can leave the funnel, and no digits are lost at its wall.
 

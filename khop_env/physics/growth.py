@@ -1,7 +1,7 @@
 """How fast two solutions of a drift may part: what a model declares so that an old message is still a bound.
 
 For p' = f(p) and x' = f(x) + g + w the distance obeys, component by component, |x - p|' <= Lambda |x - p| + |g| + |w|:
-docs/theory_certificates.md.
+docs/theory/certificates.md.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ def _fixed_graph(scenario: Scenario) -> Assumption:
             statement,
             "doesn't hold",
             f"{one_way} of {edges} links go one way. In continuous time our extension of Theorems 1 to 3 holds instead "
-            "(docs/theory_graphs.md): the graph is fixed, and each target reaches its observers by the links. At the "
+            "(docs/theory/graphs.md): the graph is fixed, and each target reaches its observers by the links. At the "
             "grid points of the proximal step the funnels are kept by construction",
         )
     kind = f"connected, and all its {edges} links go both ways" if scenario.communication.is_directed() else None

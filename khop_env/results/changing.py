@@ -23,7 +23,7 @@ def changing_graph(scenario: Scenario) -> str:
     found = [
         f"{changes} ({', '.join(kinds)}). By theorem bounds hold between changes, from where the funnels have "
         "been widened to hold the jump; by construction at the grid points of the proximal step, for the links that "
-        "are up then (docs/theory_graphs.md)"
+        "are up then (docs/theory/graphs.md)"
     ]
     known = tuple(part for part in parts if not isinstance(part, Range))
     if len(known) < len(parts):

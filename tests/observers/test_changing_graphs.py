@@ -1,4 +1,4 @@
-"""Observers on graphs whose links come and go: docs/theory_graphs.md, section 3."""
+"""Observers on graphs whose links come and go: docs/theory/graphs.md, section 3."""
 
 import copy
 import dataclasses

@@ -1,4 +1,4 @@
-"""Directed communication graphs: our extension of the paper's theorems (docs/theory_graphs.md), and of the solve."""
+"""Directed communication graphs: our extension of the paper's theorems (docs/theory/graphs.md), and of the solve."""
 
 import os
 

@@ -97,7 +97,7 @@ def test_a_clock_skew_widens_bounds_by_age_and_drift() -> None:
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.type)
 def test_skew_and_rounding_only_widen(model) -> None:
-    """The two terms of a skew (docs/theory_certificates.md) are both in it, and rounding counts once a link."""
+    """The two terms of a skew (docs/theory/certificates.md) are both in it, and rounding counts once a link."""
     design = design_of([model] * 3)
     x = np.full(design.fleet.n, 0.4)
     known = {"period": T, "estimator": "relay", "center": x, "radius": 0.1}

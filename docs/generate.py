@@ -1,0 +1,32 @@
+"""Pages of the site that are made from the library: environments, the command line, the changelog."""
+
+from pathlib import Path
+
+
+def all_pages(docs: Path) -> None:
+    """Write every generated page below docs/_generated... (see each function)."""
+    for maker in (environments, changelog):
+        maker(docs)
+
+
+def environments(docs: Path) -> None:
+    """A page for each environment, from the documentation string of its module."""
+    import importlib
+
+    from khop_env.catalog import ENVIRONMENTS
+
+    for name in ENVIRONMENTS:
+        module = importlib.import_module(f"khop_env.{name}")
+        _write(docs / "environments" / f"{name}.md", (module.__doc__ or "").strip() + "\n")
+
+
+def changelog(docs: Path) -> None:
+    """The changelog of the repository."""
+    _write(docs / "changelog.md", (docs.parent / "CHANGELOG.md").read_text(encoding="utf-8"))
+
+
+def _write(page: Path, text: str) -> None:
+    """Write a page if it differs, so that Sphinx reads again only what has changed."""
+    if not page.exists() or page.read_text(encoding="utf-8") != text:
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text(text, encoding="utf-8")
