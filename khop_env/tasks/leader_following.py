@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import AgentModel, Fleet, did_you_mean, hop_distances, hops_from_targets, velocity_to_input
 from khop_env.tasks.base import Signature, World
@@ -71,8 +72,9 @@ class LeaderFollowing(EdgeTask):
             "phase": np.ones((world.num_envs, *shape, SINES)),
             "start": np.zeros((world.num_envs, *shape)),  # m, where the routes begin
         }
-        self._amplitude = np.array(self.speeds).reshape(-1, 1, 1) * math.sqrt(2.0 / (SINES * shape[1]))
+        self._amplitude = np.array(self.speeds) * math.sqrt(2.0 / (SINES * shape[1]))
         self._positions = fleet.position_index[list(chosen)]
+        self._velocity = np.zeros((world.num_envs, *shape))
 
     def relations(self, world: World) -> tuple[IntArray, FloatArray]:
         """An edge from each follower to its leader, with its place on the ring around it."""
@@ -96,12 +98,9 @@ class LeaderFollowing(EdgeTask):
 
     def drive(self, world: World, u: FloatArray) -> None:
         """The leaders' inputs along their routes."""
-        frequency, phase = self.memory["frequency"], self.memory["phase"]
-        states, inputs = world.x.T, u.T
-        angle = frequency * world.t[:, None, None, None] + phase
-        velocity = (self._amplitude * np.sin(angle)).sum(axis=-1)
-        route = self.memory["start"] + (self._amplitude * (np.cos(phase) - np.cos(angle)) / frequency).sum(axis=-1)
-        velocity += POSITION_GAIN * (route - states[:, self._positions])
+        states, inputs, velocity, memory = world.x.T, u.T, self._velocity, self.memory
+        routes = memory["frequency"], memory["phase"], memory["start"], self._amplitude
+        _commanded(world.t, world.x, self._positions, *routes, velocity)
         fleet = world.fleet
         for number, i in enumerate(self.leader_indices):
             own = states[:, fleet.state_slice(i)]
@@ -113,6 +112,31 @@ class LeaderFollowing(EdgeTask):
         leaders = [f"{ids[i]} at {speed} m/s" for i, speed in zip(self.leader_indices, self.speeds, strict=True)]
         found = super().signature(world)
         return {"tasks": found.pop("tasks"), "leaders": tuple(leaders), **found}
+
+
+@compiled
+def _commanded(
+    t: FloatArray,
+    x: FloatArray,
+    positions: IntArray,
+    frequency: FloatArray,
+    phase: FloatArray,
+    start: FloatArray,
+    amplitude: FloatArray,
+    velocity: FloatArray,
+) -> None:
+    """Velocities (B, leaders, axes) along the routes, and back to them."""
+    for env in range(velocity.shape[0]):
+        for leader in range(velocity.shape[1]):
+            for axis in range(velocity.shape[2]):
+                speed, moved = 0.0, 0.0
+                for sine in range(SINES):
+                    rate, first = frequency[env, leader, axis, sine], phase[env, leader, axis, sine]
+                    angle = rate * t[env] + first
+                    speed += amplitude[leader] * math.sin(angle)
+                    moved += amplitude[leader] * (math.cos(first) - math.cos(angle)) / rate
+                place = start[env, leader, axis] + moved - x[positions[leader, axis], env]
+                velocity[env, leader, axis] = speed + POSITION_GAIN * place
 
 
 def _speed(model: AgentModel) -> float:
