@@ -10,7 +10,9 @@ from collections.abc import Iterable
 
 import networkx as nx
 import numpy as np
+from numpy.typing import NDArray
 
+from khop_env.compiled import compiled
 from khop_env.physics.agent_model import FloatArray
 
 _LISTED = 8  # entries of a long list that an error message lists
@@ -234,19 +236,33 @@ def random_geometric_graph(agents: int, mean_degree: float, rng: np.random.Gener
 
 def _minimum_spanning_tree(points: FloatArray) -> list[tuple[int, int]]:
     """Edges of the Euclidean minimum spanning tree, by Prim's algorithm: O(N^2) time, O(N) memory."""
-    nearest2 = np.full(len(points), np.inf)  # squared distance to the tree; nan once inside it
-    parent = np.zeros(len(points), dtype=np.intp)
+    edges = np.zeros((len(points) - 1, 2), np.int64)
+    _prim(points, edges)
+    return [(a, b) for a, b in edges.tolist()]
+
+
+@compiled
+def _prim(points: FloatArray, edges: NDArray[np.int64]) -> None:
+    """Edges (N - 1, 2), from the tree's agent to the new one, in the order in which they are found."""
+    agents = len(points)
+    distance2 = np.full(agents, np.inf)  # squared, to the tree
+    parent = np.zeros(agents, np.int64)
+    outside = np.ones(agents, np.bool_)
     newest = 0
-    edges = []
-    for _ in range(len(points) - 1):
-        nearest2[newest] = np.nan
-        distance2 = _squared_distances(points[newest : newest + 1], points)[0]
-        closer = distance2 < nearest2
-        nearest2[closer] = distance2[closer]
-        parent[closer] = newest
-        newest = int(np.nanargmin(nearest2))
-        edges.append((int(parent[newest]), newest))
-    return edges
+    for edge in range(agents - 1):
+        outside[newest] = False
+        x, y = points[newest]
+        nearest = -1
+        for agent in range(agents):
+            if outside[agent]:
+                dx, dy = x - points[agent, 0], y - points[agent, 1]
+                away2 = dx * dx + dy * dy
+                if away2 < distance2[agent]:
+                    distance2[agent], parent[agent] = away2, newest
+                if nearest < 0 or distance2[agent] < distance2[nearest]:
+                    nearest = agent
+        edges[edge, 0], edges[edge, 1] = parent[nearest], nearest
+        newest = nearest
 
 
 def _squared_distances(a: FloatArray, b: FloatArray) -> FloatArray:
