@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -161,9 +160,7 @@ class ObservationColumns:
             for axis, feature, own in zip(self._axes, position, fleet.position_index[i], strict=True)
         ]
         columns += [
-            replace(
-                _state(name, feature, (_ESTIMATE if estimate else _STATE)[feature.how], origin, self._limit), gate=gate
-            )
+            _state(name, feature, (_ESTIMATE if estimate else _STATE)[feature.how], origin, self._limit, gate)
             for feature in rest
         ]
         columns += self._padding(name, self._most_rest - len(rest))
@@ -226,20 +223,17 @@ class ObservationColumns:
     def _padded(self, columns: list[list[Column]], slots: list[int]) -> list[list[Column]]:
         """Columns padded to equally many slots for every agent, with common bounds: one Box."""
         width, most = max(map(len, columns)), max(slots)
+        padding: dict[tuple[int, int], list[Column]] = {}  # of a slot, by its number and width
         for its_columns, count in zip(columns, slots, strict=True):
             slot_width = (width - len(its_columns)) // max(most - count, 1)
             for number in range(count, most):
-                name = f"slot{number}"
-                its_columns += [_flag(f"{name}.valid", False), *self._padding(name, slot_width - 1)]
-        low = np.min([[column.field.low for column in its_columns] for its_columns in columns], axis=0)
-        high = np.max([[column.field.high for column in its_columns] for its_columns in columns], axis=0)
-        return [
-            [
-                replace(column, field=Field(column.field.name, column.field.unit, a, b), clip=column.bounds)
-                for column, a, b in zip(its_columns, low.tolist(), high.tolist(), strict=True)
-            ]
-            for its_columns in columns
-        ]
+                if (number, slot_width) not in padding:
+                    name = f"slot{number}"
+                    padding[number, slot_width] = [_flag(f"{name}.valid", False), *self._padding(name, slot_width - 1)]
+                its_columns += padding[number, slot_width]
+        low = np.min([[column.field.low for column in its_columns] for its_columns in columns], axis=0).tolist()
+        high = np.max([[column.field.high for column in its_columns] for its_columns in columns], axis=0).tolist()
+        return [list(map(_within, its_columns, low, high)) for its_columns in columns]
 
 
 def state_columns(fleet: Fleet, i: int, name: str, limit: float) -> list[Column]:
@@ -260,14 +254,23 @@ def global_state(fleet: Fleet, limit: float, inputs: bool) -> tuple[list[Field],
     return [column.field for column in columns], Readout(columns, [0] * len(columns))
 
 
-def _state(name: str, feature: Feature, kind: int, origin: int, limit: float) -> Column:
+def _state(name: str, feature: Feature, kind: int, origin: int, limit: float, gate: int = -1) -> Column:
     limit = limit if feature.how == "value" else 1.0
-    return Column(Field(f"{name}.{feature.name}", feature.unit, -limit, limit), kind, origin + feature.component)
+    field = Field(f"{name}.{feature.name}", feature.unit, -limit, limit)
+    return Column(field, kind, origin + feature.component, gate=gate)
 
 
 def _from_task(prefix: str, column: TaskColumn) -> Column:
     field = Field(f"{prefix}{column.name}", column.unit, column.low, column.high)
     return Column(field, value=float(column.value)) if column.row is None else Column(field, TASK, column.row)
+
+
+def _within(column: Column, low: float, high: float) -> Column:
+    """A column of a Box with wider bounds; its values keep to its own."""
+    field = column.field
+    if field.low == low and field.high == high:
+        return column
+    return column._replace(field=Field(field.name, field.unit, low, high), clip=column.bounds)
 
 
 def _flag(name: str, value: bool) -> Column:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +20,7 @@ from khop_env.physics import AgentModel, did_you_mean, hops_from_targets
 Float32Array = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Field:
+class Field(NamedTuple):
     """One column of an observation.
 
     Attributes:

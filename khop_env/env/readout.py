@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +20,7 @@ VALID, HEARD, HOPS, AGE = range(4)
 _TILE = 32  # number of environments whose values of a column are computed before they are written
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """A field and the source of its value.
 
     Attributes:
