@@ -49,12 +49,14 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 python_maximum_signature_line_length = 100
 python_use_unqualified_type_names = True
+toc_object_entries_show_parents = "hide"
 
 smartquotes = False  # quotes in docstrings are Python's, and -- begins an option
 
 html_theme = "furo"
 html_title = "khop_env"
 html_static_path = ["_static"]
+html_css_files = ["site.css"]
 copybutton_prompt_text = "$ "
 
 
@@ -63,4 +65,4 @@ def setup(app):
     app.connect("autodoc-process-docstring", docstrings.markup, priority=400)  # before napoleon's handler
     app.connect("autodoc-process-signature", docstrings.signature)
     app.connect("autodoc-skip-member", docstrings.skip)
-    app.connect("doctree-resolved", docstrings.property_types)
+    app.connect("doctree-resolved", docstrings.other_types)

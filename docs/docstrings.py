@@ -29,13 +29,14 @@ PACKAGES = (
 """Packages with public names. A name that several of them have is documented as that of the first."""
 
 _SPAN = re.compile(r"`([^`]+)`", re.DOTALL)
+_MARKUP = re.compile(r"\*\w+\*|[|*\\](?=\S)|(?<=\w)_(?=\W|$)")  # *emphasis* is meant
 _PAGE = re.compile(r"\bdocs/(\w+/\w+)\.md\b")
+_ARRAY = r"~?(?:numpy\.)?ndarray\[~?tuple\[~?(?:typing\.)?Any, \.\.\.\], ~?(?:numpy\.)?dtype\["
 _HINTS = (
     (r"TypeAliasForwardRef\('(\w+)'\)", r"\1"),
-    (
-        r"~?(?:numpy\.)?ndarray\[~?tuple\[~?(?:typing\.)?Any, \.\.\.\], ~?(?:numpy\.)?dtype\[~?(?:numpy\.)?(\w+)\]\]",
-        r"NDArray[np.\1]",
-    ),
+    (_ARRAY + r"~?(?:typing\.)?Any\]\]", "NDArray[Any]"),
+    (_ARRAY + r"~?(?:numpy\.)?(\w+)\]\]", r"NDArray[np.\1]"),
+    ("<factory>", "..."),
 )
 _CLASS = re.compile(r"(?:khop_env|agents)(?:\.\w+)*\.(\w+)")
 _known: dict[str, str] = {}
@@ -55,7 +56,8 @@ def markup(app: Any, what: str, name: str, obj: Any, options: Any, given: list[s
     if what == "data":
         given[:] = _below(name.rpartition(".")[2], obj)
     if isinstance(obj, type) and (bases := _bases(obj)):
-        given[:0] = [bases, ""]
+        end = given.index("") if "" in given else len(given)  # of the first paragraph, which overviews show
+        given[end:end] = ["", bases]
     section, kinds = False, []
     for line in given:
         if line and not line.startswith(" "):
@@ -71,7 +73,9 @@ def markup(app: Any, what: str, name: str, obj: Any, options: Any, given: list[s
         block = [line for _, line in group]
         changed += ["", "::", "", *block, ""] if is_code else _text("\n".join(block), name).split("\n")
     if what in ("property", "data"):  # there napoleon reads no sections, and takes what is before a colon for a type
-        changed = ["..", "", *GoogleDocstring(changed, app.config, app, "method", name, obj, options).lines()]
+        changed = GoogleDocstring(changed, app.config, app, "method", name, obj, options).lines()
+        if ":" in "".join(changed[:1]):
+            changed[:0] = ["..", ""]
     given[:] = changed
 
 
@@ -87,12 +91,13 @@ def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) 
     return True if type(obj).__name__ == "_tuplegetter" else None
 
 
-def property_types(app: Any, doctree: Any, page: str) -> None:
-    """Handler of the event for finished pages: types of properties, for which there is no other event."""
-    for node in doctree.findall(addnodes.desc_annotation):
-        text = node.astext()
-        if (short := _short(text)) != text:
-            node[:] = [nodes.Text(short)]
+def other_types(app: Any, doctree: Any, page: str) -> None:
+    """Handler of the event for finished pages: types of properties and aliases, for which there is no other event."""
+    for kind in (addnodes.desc_annotation, nodes.paragraph):
+        for node in doctree.findall(kind):
+            text = node.astext()
+            if (kind is addnodes.desc_annotation or text.startswith("alias of ")) and _short(text) != text:
+                node[:] = [nodes.Text(_short(text))]
 
 
 def _below(name: str, obj: Any) -> list[str]:
@@ -125,7 +130,8 @@ def _text(text: str, name: str) -> str:
             place = _place(part, name)
             parts[k] = f":py:obj:`{part} <{place}>`" if place else f"`{part}`"
         else:
-            parts[k] = _PAGE.sub(r":doc:`/\1`", re.sub(r"([|*\\])(?=\S)|(?<=\w)(_)(?=\W|$)", r"\\\1\2", part))
+            literal = _MARKUP.sub(lambda found: found[0] if len(found[0]) > 1 else f"\\{found[0]}", part)
+            parts[k] = _PAGE.sub(r":doc:`/\1`", literal)
     return "".join(parts)
 
 
@@ -134,12 +140,13 @@ def _place(text: str, name: str) -> str | None:
     words = text.removesuffix("()").split(".")
     if not all(word.isidentifier() for word in words):
         return None
-    known, certain = public_names(), text.endswith("()") or words[0] in ("khop_env", "agents")
-    while len(words) > 1 and words[0].islower():  # packages
-        del words[0]
+    packages = {word for package in PACKAGES for word in package.split(".")}
+    known, certain = public_names(), text.endswith("()") or words[0] in packages
     owner = name if isinstance(_found(name), type) else name.rpartition(".")[0]
     if len(words) == 1 and isinstance(_found(owner), type) and callable(_found(f"{owner}.{words[0]}")):
         return f"{owner}.{words[0]}"
+    while len(words) > 1 and words[0] in packages:
+        del words[0]
     # a common word in lower case may also be an argument's name
     if words[0] not in known or not (certain or words[0] != words[0].lower() or "_" in words[0]):
         return None

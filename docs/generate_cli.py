@@ -45,7 +45,7 @@ Tables, and one JSON object with `--json`, go to stdout; progress and messages g
 def page() -> str:
     """The whole page, in Markdown."""
     rows = "".join(
-        f"| [`khop {name}`](#khop-{name}) | {_marked(_paragraphs(command)[0])} |\n"
+        f"| [`{name}`](#khop-{name}) | {_marked(_paragraphs(command)[0])} |\n"
         for name, command in COMMANDS.items()
     )
     sections = "\n".join(_section(name, command) for name, command in COMMANDS.items())
@@ -62,9 +62,9 @@ def _section(name: str, command: Callable[..., None]) -> str:
     options = [each for each in parameters if isinstance(each.default, OptionInfo)]
     usage = "".join(f" {_argument(each)}" for each in arguments)
     text = "\n\n".join(map(_marked, _paragraphs(command)))
-    entries = [f"`{_argument(each)}`\n: {_marked(each.default.help)}\n" for each in arguments]
+    entries = [f"**`{_argument(each)}`**\n: {_marked(each.default.help)}\n" for each in arguments]
     entries += map(_option, options)
-    return f"## khop {name}\n\n```\nkhop {name} [OPTIONS]{usage}\n```\n\n{text}\n\n" + "\n".join(entries)
+    return f"## khop {name}\n\n```text\nkhop {name} [OPTIONS]{usage}\n```\n\n{text}\n\n" + "\n".join(entries)
 
 
 def _argument(parameter: ParamMeta) -> str:
@@ -89,7 +89,7 @@ def _option(parameter: ParamMeta) -> str:
     if info.default is not None and info.default is not False and info.default != "":
         default = info.default.value if isinstance(info.default, enum.Enum) else info.default
         sentences.append(f"Default: `{default}`.")
-    return f"`{name}{' ' + value if value else ''}`\n: {' '.join(sentences)}\n"
+    return f"**`{name}{' ' + value if value else ''}`**\n: {' '.join(sentences)}\n"
 
 
 def _plain(kind: Any) -> tuple[type, bool]:

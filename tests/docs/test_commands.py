@@ -113,4 +113,4 @@ def test_the_page_of_the_command_line_has_every_command_and_option(monkeypatch):
     for name, command in COMMANDS.commands.items():
         for parameter in command.params:
             shown = parameter.opts[0] if parameter.opts[0].startswith("-") else parameter.metavar
-            assert f"\n`{shown}" in sections[name], (name, shown)
+            assert f"\n**`{shown}" in sections[name], (name, shown)
