@@ -51,8 +51,7 @@ python_maximum_signature_line_length = 100
 python_use_unqualified_type_names = True
 toc_object_entries_show_parents = "hide"
 
-smartquotes = False  # quotes in docstrings are Python's, and -- begins an option
-
+smartquotes_action = "D"  # dashes only: quotes in docstrings are Python's
 html_theme = "furo"
 html_title = "khop_env"
 html_static_path = ["_static"]

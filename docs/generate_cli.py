@@ -45,8 +45,7 @@ Tables, and one JSON object with `--json`, go to stdout; progress and messages g
 def page() -> str:
     """The whole page, in Markdown."""
     rows = "".join(
-        f"| [`{name}`](#khop-{name}) | {_marked(_paragraphs(command)[0])} |\n"
-        for name, command in COMMANDS.items()
+        f"| [`{name}`](#khop-{name}) | {_marked(_paragraphs(command)[0])} |\n" for name, command in COMMANDS.items()
     )
     sections = "\n".join(_section(name, command) for name, command in COMMANDS.items())
     return f"{HEAD}| command | |\n|---|---|\n{rows}\n{sections}"
