@@ -6,6 +6,7 @@ import sys
 from itertools import groupby
 from typing import Any
 
+import numpy as np
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.ext.napoleon import GoogleDocstring
@@ -87,8 +88,8 @@ def signature(app: Any, what: str, name: str, obj: Any, options: Any, given: str
 
 
 def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
-    """Handler of autodoc's event for members: no entries "Alias for field number 0" of named tuples."""
-    return True if type(obj).__name__ == "_tuplegetter" else None
+    """Handler of autodoc's event for members: none that only the class of their value describes."""
+    return True if type(obj).__name__ == "_tuplegetter" or isinstance(obj, np.ndarray) else None
 
 
 def other_types(app: Any, doctree: Any, page: str) -> None:
