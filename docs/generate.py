@@ -5,7 +5,7 @@ from pathlib import Path
 
 def all_pages(docs: Path) -> None:
     """Write every generated page below docs/_generated... (see each function)."""
-    for maker in (environments, changelog):
+    for maker in (environments, command_line, changelog):
         maker(docs)
 
 
@@ -18,6 +18,13 @@ def environments(docs: Path) -> None:
     for name in ENVIRONMENTS:
         module = importlib.import_module(f"khop_env.{name}")
         _write(docs / "environments" / f"{name}.md", (module.__doc__ or "").strip() + "\n")
+
+
+def command_line(docs: Path) -> None:
+    """The commands with their arguments and options."""
+    import generate_cli
+
+    _write(docs / "command_line.md", generate_cli.page())
 
 
 def changelog(docs: Path) -> None:

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from khop_env.physics.growth import Growth
 
 FloatArray: TypeAlias = NDArray[np.float64]
+"""An array of float64."""
 Array = TypeVar("Array", bound=np.ndarray)
 IndexArray: TypeAlias = NDArray[np.intp]
+"""An array of indices."""
 InputLimit: TypeAlias = Any  # set to a number or one per input; read as a float array of shape (m,)
 
 
