@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 PAGE = Path(__file__).parents[2] / "docs" / "concepts" / "symbols.md"
-NAMES = sorted(set(re.findall(r"`((?:khop_env|agents)[\w.]*)`", PAGE.read_text(encoding="utf-8"))))
+TABLES = "".join(line for line in PAGE.read_text(encoding="utf-8").splitlines(keepends=True) if line.startswith("|"))
+NAMES = [
+    name if name.startswith("agents.") else f"khop_env.{name}" for name in sorted(set(re.findall(r"`([^`]+)`", TABLES)))
+]
 
 
 def has(found: object, name: str) -> bool:
