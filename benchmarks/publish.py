@@ -48,13 +48,18 @@ def stamp(command: str) -> str:
     Args:
         command: that makes it again.
     """
-    say_commit = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=10"]
-    done = subprocess.run(say_commit, capture_output=True, text=True, check=False)
-    commit = f"commit {done.stdout.strip()}" if done.returncode == 0 else "no git repository"
+    changed = _git("status", "--porcelain", "--", "khop_env", "agents", "benchmarks")
+    commit = f"commit {_git('rev-parse', '--short=10', 'HEAD') or 'unknown'}{', with changes' if changed else ''}"
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba"))
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} shared cores"
     python = f"Python {platform.python_version()}, {packages}"
     return f"*`{command}` on {date.today().isoformat()}, {commit}; {machine}; {python}.*"
+
+
+def _git(*arguments: str) -> str:
+    """Output of a git command in the repository; empty where there is none."""
+    done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
+    return done.stdout.strip()
 
 
 def speed(options: argparse.Namespace) -> Iterable[str]:
