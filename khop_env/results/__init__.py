@@ -2,6 +2,8 @@
 
 from khop_env.results.assumptions import Assumption, assumptions
 from khop_env.results.curves import error_over_time, learning_curves, network_figure, set_iss_figure
+from khop_env.results.dataset import EpisodeDataset
+from khop_env.results.episodes import EpisodeRecorder
 from khop_env.results.figures import paper_figure
 from khop_env.results.metrics import consensus_error, summarize
 from khop_env.results.network_report import network_report
@@ -14,6 +16,8 @@ from khop_env.results.writing import RunFileError, write_run
 
 __all__ = [
     "Assumption",
+    "EpisodeDataset",
+    "EpisodeRecorder",
     "MessageRecord",
     "NetworkRow",
     "ObserverRecord",
