@@ -40,7 +40,7 @@ integrations: .peers/rllib/done .peers/torchrl/done .peers/tianshou/done
 SMALL := examples/data/khop_small
 dataset: .venv/core
 	rm -rf $(SMALL)/leader_following $(SMALL)/navigation
-	$(BIN)/khop evaluate leader_following_v0 --policies leader_following,random --observe estimate --network wifi,lossy:loss=0.3,burst=5 --episodes 6 --env max_cycles=80 --env bounds=true --record $(SMALL)/leader_following
+	$(BIN)/khop evaluate leader_following_v0 --policies leader_following,random --observe estimate --network wifi,lossy:loss=0.3,burst=5 --episodes 5 --env max_cycles=80 --env bounds=true --record $(SMALL)/leader_following
 	$(BIN)/khop evaluate navigation_v0 --scenario crossing:agents=4 --policies filter,go_to_goal,random --observe estimate --network wifi,lossy:loss=0.3,burst=5 --episodes 6 --env max_cycles=100 --env bounds=true --env control_period=0.1 --record $(SMALL)/navigation
 
 .peers/rllib/done: PACKAGES = -e '.[ray]' torch
