@@ -6,6 +6,7 @@ from khop_env.results.dataset import EpisodeDataset
 from khop_env.results.episodes import EpisodeRecorder
 from khop_env.results.figures import paper_figure
 from khop_env.results.metrics import consensus_error, summarize
+from khop_env.results.minari_dataset import write_minari
 from khop_env.results.network_report import network_report
 from khop_env.results.networks import NetworkRow, measure_networks
 from khop_env.results.recording import Recording, record
@@ -37,5 +38,6 @@ __all__ = [
     "set_iss_figure",
     "states_table",
     "summarize",
+    "write_minari",
     "write_run",
 ]

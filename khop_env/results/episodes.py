@@ -112,7 +112,7 @@ class EpisodeRecorder:
             self._write(len(self._results))
 
     def end(self) -> list[Part]:
-        """The tables of these episodes, in parts; rows in the order of seed, step, agent or observer."""
+        """The tables of these episodes, in parts; rows by seed, step, and agent or pair of the layout."""
         self._results.append({name: np.zeros_like(each) for name, each in self._last.items()})
         self._write(len(self._rows))
         return self._parts
