@@ -1,4 +1,4 @@
-"""`khop evaluate --ray` gives the numbers and files of one machine; in an environment of its own (make integrations)."""
+"""`khop evaluate --ray` gives numbers and files of one machine; in an environment of its own (make integrations)."""
 
 import tempfile
 from pathlib import Path

@@ -112,6 +112,8 @@ def quantities(env: BatchedEnv) -> Iterable[Quantity]:
     fleet = env.fleet
     acting = {fleet.agent(agent): number for number, agent in enumerate(env.agents)}
     actions = action_names(env)
+    if not env.begun.all():
+        env.reset(0)  # tasks needn't be able to evaluate anything before
     infos = [name for name in env.task.evaluate(env.world).infos if name not in SHARED_INFOS]
     for i, model in enumerate(fleet.models):
         for c, (name, unit) in enumerate(model.states.items(), int(fleet.state_offset[i])):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -147,7 +148,7 @@ def agents(env: BatchedEnv) -> dict[str, Any]:
             "acts": name in env.agents,
             "states": dict(model.states),
             "inputs": {
-                entry: {"unit": unit, "limit": limit if limit < float("inf") else None}
+                entry: {"unit": unit, "limit": limit if math.isfinite(limit) else None}
                 for (entry, unit), limit in zip(model.inputs.items(), model.input_limit.tolist(), strict=True)
             },
         }
@@ -177,6 +178,8 @@ def _plain(name: str, value: Any) -> Any:
         return getattr(value, "name", value)
     if name == "network" and dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
     return dict(value) if isinstance(value, Mapping) else list(value) if isinstance(value, tuple) else value
 
 
