@@ -283,11 +283,12 @@ class _Player:
 
     def __call__(self, task: _Task) -> _Played:
         spec, observe, needed, network, seeds = task
-        env, recorder, parts = self.environment(observe, needed, network), None, list[Part]()
-        if self.columns is not None:
-            name = network or self.network(observe, needed)
-            recorder = EpisodeRecorder(env, spec, name, self.columns)
-        return play(env, make_policy(spec), seeds, name=spec, recorder=recorder, recorded=parts.extend), parts
+        env, policy = self.environment(observe, needed, network), make_policy(spec)
+        if self.columns is None:
+            return play(env, policy, seeds, name=spec), []
+        parts: list[Part] = []
+        recorder = EpisodeRecorder(env, spec, network or self.network(observe, needed), self.columns)
+        return play(env, policy, seeds, name=spec, recorder=recorder, recorded=parts.extend), parts
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_made": {}}
