@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test quick lint docs docs-open bench integrations clean
+.PHONY: demo test quick lint docs docs-open bench integrations dataset clean
 
 demo: .venv/core
 	$(BIN)/khop run paper
@@ -35,6 +35,13 @@ integrations: .peers/rllib/done .peers/torchrl/done .peers/tianshou/done
 	.peers/rllib/bin/python examples/integrations/run_evaluation_on_ray.py
 	for how in '' --per-type; do .peers/rllib/bin/python examples/learning/train_rllib.py --iterations 2 $$how || exit 1; done
 	for how in '' --ippo; do .peers/torchrl/bin/python examples/learning/train_torchrl.py --iterations 3 $$how || exit 1; done
+
+# The data set of examples/data, the same bytes again with the same versions
+SMALL := examples/data/khop_small
+dataset: .venv/core
+	rm -rf $(SMALL)/leader_following $(SMALL)/navigation
+	$(BIN)/khop evaluate leader_following_v0 --policies leader_following,random --observe estimate --network wifi,lossy:loss=0.3,burst=5 --episodes 5 --env max_cycles=80 --env bounds=true --record $(SMALL)/leader_following
+	$(BIN)/khop evaluate navigation_v0 --scenario crossing:agents=4 --policies filter,go_to_goal,random --observe estimate --network wifi,lossy:loss=0.3,burst=5 --episodes 6 --env max_cycles=100 --env bounds=true --env control_period=0.1 --record $(SMALL)/navigation
 
 .peers/rllib/done: PACKAGES = -e '.[ray]' torch
 .peers/torchrl/done: PACKAGES = -e . 'torchrl>=0.14'
