@@ -4,20 +4,19 @@ from pathlib import Path
 
 
 def all_pages(docs: Path) -> None:
-    """Write every generated page below docs/_generated... (see each function)."""
+    """Write every generated page; git ignores them."""
     for maker in (environments, command_line, changelog):
         maker(docs)
 
 
 def environments(docs: Path) -> None:
-    """A page for each environment, from the documentation string of its module."""
-    import importlib
+    """A page for each environment."""
+    from environment_page import environment_page
 
     from khop_env.catalog import ENVIRONMENTS
 
     for name in ENVIRONMENTS:
-        module = importlib.import_module(f"khop_env.{name}")
-        _write(docs / "environments" / f"{name}.md", (module.__doc__ or "").strip() + "\n")
+        _write(docs / "environments" / f"{name}.md", environment_page(name))
 
 
 def command_line(docs: Path) -> None:
