@@ -23,7 +23,9 @@ def environment_page(name: str) -> str:
     for section in sections:
         heading, _, text = section.partition("\n")
         if heading == "Observation Space":
-            text = re.sub(r"(?m)^\| (?!Columns )(\S.*?) +\|", r"| `\1` |", text) + observations(module)
+            text = re.sub(r"(?m)^\| (?!Columns )(\S.*?) +\|", r"| `\1` |", text)
+            text = re.sub(r"(?<![`\w.])\w+\.<\w+>[\w.]*", r"`\g<0>`", text)  # else <state> would be a tag of HTML
+            text += observations(module)
         page += f"\n## {heading}\n{text}"
         if heading == "Reward":
             page += policies(name, module)
