@@ -1,6 +1,7 @@
 """Pages of environments are made from the library, and agree with it."""
 
 import importlib
+import itertools
 import re
 import sys
 from pathlib import Path
@@ -96,7 +97,7 @@ def test_every_column_is_described(name, scenario):
 def test_headings_are_consecutive(page):
     levels = [len(found) for found in re.findall(r"^(#+) ", re.sub(r"(?ms)^```.*?^```", "", page[1]), re.MULTILINE)]
     assert levels[0] == 1
-    assert all(later <= level + 1 for level, later in zip(levels, levels[1:], strict=False))
+    assert all(later <= level + 1 for level, later in itertools.pairwise(levels))
 
 
 def test_the_python_runs(page, capsys):
