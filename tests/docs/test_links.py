@@ -94,7 +94,8 @@ def pages(tmp_path_factory):
 
 
 def test_every_link_leads_somewhere(pages):
-    assert not broken(pages)
+    faults = broken(pages)
+    assert not faults, "\n".join(faults)
 
 
 def test_no_image_is_left_over(pages):
