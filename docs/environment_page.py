@@ -127,12 +127,18 @@ def policies(name: str, module: Any) -> str:
     task = module.parallel_env().batched.task
     default = task.default_policy or scenario(task.default_scenario).law.name
     shipped = [LearnedPolicy.load(path).about["scenario"] for path in sorted(PRETRAINED.glob(f"{name}@*.npz"))]
+    where = "" if shipped[0] == task.default_scenario else f" --scenario {shipped[0]}"
     measured = "[](../benchmarks/learning.md)" + ", [](../benchmarks/safety.md)" * (task.default_policy is not None)
     return f"""
 ## Policies
 
-`khop run {name}` plays `{default}`, and another policy with `--controller`.
-Trained ones are shipped for {" and ".join(f"`{each}`" for each in shipped)}: `--controller ppo:pretrained`.
+`khop run {name}` plays `{default}`, and another policy with `--controller`. Trained policies are shipped for
+{" and ".join(f"`{each}`" for each in shipped)}:
+
+```
+khop run {name}{where} --controller ppo:pretrained
+```
+
 What policies reach: {measured}.
 
 """

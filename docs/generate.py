@@ -1,5 +1,6 @@
 """Pages of the site that are made from the library: environments, the command line, the changelog."""
 
+import re
 from pathlib import Path
 
 
@@ -27,8 +28,9 @@ def command_line(docs: Path) -> None:
 
 
 def changelog(docs: Path) -> None:
-    """The changelog of the repository."""
-    _write(docs / "changelog.md", (docs.parent / "CHANGELOG.md").read_text(encoding="utf-8"))
+    """The changelog of the repository, with links to pages."""
+    text = (docs.parent / "CHANGELOG.md").read_text(encoding="utf-8")
+    _write(docs / "changelog.md", re.sub(r"(?<![\w(/])docs/([\w/]+\.md)", r"[](\1)", text))
 
 
 def _write(page: Path, text: str) -> None:

@@ -123,5 +123,34 @@ def test_policies_are_shipped(page):
     from agents.learning import PRETRAINED, pretrained_name
 
     name, text = page
-    scenarios = re.findall(r"`([^`]+)`", re.search(r"are shipped for (.*): `", text)[1])
+    scenarios = re.findall(r"`([^`]+)`", re.search(r"are shipped for\n(.*):\n", text)[1])
     assert {pretrained_name(name, each) for each in scenarios} == {path.stem for path in PRETRAINED.glob(f"{name}@*")}
+    command = re.search(r"(?m)^khop run \S+( --scenario (\S+))? --controller ppo:pretrained$", text)
+    assert (command[2] or khop_env.make(name).batched.task.default_scenario) in scenarios
+
+
+def test_the_comparison_is_true(page):
+    """Of the overview: who acts, how long, where."""
+    name, _ = page
+    env = khop_env.make(name)
+    task, settings = env.batched.task, env.batched.settings
+    overview = (ROOT / "docs" / "environments" / "index.md").read_text(encoding="utf-8")
+    table = re.search(r"(?ms)^\| \| .*?\n\n", overview)[0]
+    rows = [re.split(r" *\| *", line)[1:-1] for line in table.splitlines() if line]
+    column = rows[0].index(f"`{name}`")
+    said = {row[0]: row[column] for row in rows[1:]}
+    assert re.search(r"\d+", said["Who acts"])[0] == str(len(env.possible_agents))
+    duration = settings.max_cycles * settings.control_period
+    assert said["Episode"].startswith(f"{duration:g} s, {settings.max_cycles} actions")
+    assert said["Default scenario"] == f"`{task.default_scenario}`"
+
+
+def test_views_are_made_as_said():
+    import gymnasium
+
+    overview = (ROOT / "docs" / "environments" / "index.md").read_text(encoding="utf-8")
+    table = overview.partition("| View |")[2].partition("\n\n")[0]
+    calls = re.findall(r"(?m)^\| (\w+) \| `([^`]+)` \|", table)
+    assert [name for name, _ in calls] == ["parallel", "AEC", "batched", "vector", "SB3", "joint"]
+    for _, call in calls:
+        eval(call, {"khop_env": khop_env, "gymnasium": gymnasium, "consensus_v0": khop_env.consensus_v0})
