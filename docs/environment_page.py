@@ -34,6 +34,8 @@ def environment_page(name: str) -> str:
 
 def film(name: str) -> str:
     """The film, what is in it, and the command that makes it."""
+    if name not in FILMS:
+        raise KeyError(f"there is no film of {name}: add one to FILMS in docs/films.py, and run it")
     shown = FILMS[name]
     return f"""![A film of {name}: {shown.caption}](../images/{name}.gif)
 
@@ -98,7 +100,7 @@ def columns(env: KHopEnv, agent: str) -> str:
     for number, field in enumerate(layout.fields):
         if not field.name.startswith("slot") or field.name.startswith(f"{shown}."):
             limits = f"{field.low:g} to {field.high:g}"
-            lines.append(f"| {number} | `{field.name}` | {field.unit} | {limits} | {values[field.name]:.3g} |")
+            lines.append(f"| {number} | `{field.name}` | {field.unit} | {limits} | {values[field.name] + 0.0:.3g} |")
     return "\n".join(lines) + "\n"
 
 
