@@ -126,11 +126,11 @@ def test_no_image_is_left_over(pages):
         ('<img src="nothing.png">', "there is no nothing.png"),
         (":img-top: nothing.png", "there is no nothing.png"),
         ("```{figure} nothing.png\n```", "there is no nothing.png"),
-        ("[text](other.md#third)", "docs/other.md has no heading #third"),
-        ("[text](#third)", "docs/page.md has no heading #third"),
+        ("[text](other.md#third)", "site/other.md has no heading #third"),
+        ("[text](#third)", "site/page.md has no heading #third"),
     ],
 )
 def test_faults_are_found(link, fault):
     other = "# One\n\n## The `second`, one!\n\n(label)=\n## The second one\n"
-    pages = {"docs/page.md": FENCE.sub("", f"# Page\n\n{link}\n"), "docs/other.md": other}
-    assert broken(pages) == ([] if fault is None else [f"docs/page.md: {fault}"])
+    pages = {"site/page.md": FENCE.sub("", f"# Page\n\n{link}\n"), "site/other.md": other}
+    assert broken(pages) == ([] if fault is None else [f"site/page.md: {fault}"])
