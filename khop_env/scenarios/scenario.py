@@ -25,6 +25,7 @@ from khop_env.observers import (
     Proximal,
     TargetObservers,
     as_estimator,
+    as_observers,
 )
 from khop_env.observers.design import design_rule_for
 from khop_env.physics import AgentModel, Disturbance, Fleet, Links, check_task_graph, did_you_mean, validate_graph
@@ -291,9 +292,9 @@ class Scenario:
             num_envs: number of environments B.
 
         Raises:
-            ValueError: for more environments than `MOST_NUMBERS` states and estimates allow.
+            ValueError: for more environments than `MOST_NUMBERS` states and estimates allow, or observers that aren't.
         """
-        realisation = observers or self._realisation()
+        realisation = self._realisation() if observers is None else as_observers(observers)
         estimated = self.design.knowledge if realisation.by_messages else self.design.states.layout
         width = self.fleet.n + estimated.size + self.design.inputs.layout.size
         if num_envs * width > MOST_NUMBERS:
