@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.evaluation import Episodes, chosen_scenario, play
+from agents.evaluation import Episodes, chosen_scenario, play, require_seeds
 from agents.outcomes import interval95, summary
 from agents.policies import Needs, make_policy, needs
 from agents.policy import EnvDescription, describe
@@ -182,11 +182,16 @@ def compare(
         UnfinishedError: if a policy or a worker fails; its `partial` holds the results until then.
         Interrupted: on Ctrl-C, with the same `partial`; the workers have ended.
     """
-    if not len(seeds):
-        raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
+    require_seeds(seeds)
     for name, names in (("policies", policies), ("observe", observe)):
         if isinstance(names, str):
             raise ValueError(f"{name} must be a list of names, e.g. [{names!r}]; got {names!r}")
+        for one in names:
+            if not isinstance(one, str):
+                raise ValueError(
+                    f"{name} must be names, which each process can look up; got {one!r}. For objects: "
+                    "evaluate(env, {'mine': policy}, seeds), or a file's, 'my_file.py:MyPolicy'"
+                )
     if not policies or not observe or len(set(observe)) < len(observe):
         raise ValueError(
             f"expected at least one policy and one observation mode, no mode twice; got policies={list(policies)} and "

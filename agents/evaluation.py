@@ -184,8 +184,7 @@ def play(
     """
     batched = batched_of(env)
     _require_policy(policy, name)
-    if not len(seeds):
-        raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
+    require_seeds(seeds)
     parts = []
     for first in range(0, len(seeds), batched.num_envs):
         chunk = [int(seed) for seed in seeds[first : first + batched.num_envs]]
@@ -260,6 +259,18 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int, recorde
         time=period * np.arange(horizon + 1.0),
         outcomes={key: values[:count] for key, values in outcomes.result().items()},
     )
+
+
+def require_seeds(seeds: Sequence[int]) -> None:
+    """Refuse seeds that aren't one per episode.
+
+    Raises:
+        ValueError: if there are none, or it isn't a sequence.
+    """
+    if not hasattr(seeds, "__len__"):
+        raise ValueError(f"seeds must be one per episode, e.g. range(100); got {seeds!r}")
+    if not len(seeds):
+        raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
 
 
 def _require_policy(policy: object, name: str) -> None:

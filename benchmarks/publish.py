@@ -48,12 +48,16 @@ def stamp(command: str) -> str:
     Args:
         command: that makes it again.
     """
-    changed = _git("status", "--porcelain", "--", "khop_env", "agents", "benchmarks")
-    commit = f"commit {_git('rev-parse', '--short=10', 'HEAD') or 'unknown'}{', with changes' if changed else ''}"
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba"))
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} shared cores"
     python = f"Python {platform.python_version()}, {packages}"
-    return f"*`{command}` on {date.today().isoformat()}, {commit}; {machine}; {python}.*"
+    return f"*`{command}` on {date.today().isoformat()}, {commit()}; {machine}; {python}.*"
+
+
+def commit() -> str:
+    """The repository's commit, and whether code differs from it."""
+    changed = _git("status", "--porcelain", "--", "khop_env", "agents", "benchmarks")
+    return f"commit {_git('rev-parse', '--short=10', 'HEAD') or 'unknown'}{', with changes' if changed else ''}"
 
 
 def _git(*arguments: str) -> str:

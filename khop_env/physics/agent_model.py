@@ -72,6 +72,15 @@ def _same(first: FloatArray, second: FloatArray) -> bool:
     return not bool(np.any(np.abs(first - second) > 1e-9 * scale))
 
 
+def _hashable(value: object) -> object:
+    """A parameter as something that can be compared and hashed."""
+    if isinstance(value, np.ndarray):
+        return value.tobytes()
+    if isinstance(value, Mapping):
+        return tuple((key, _hashable(entry)) for key, entry in value.items())
+    return tuple(map(_hashable, value)) if isinstance(value, list) else value
+
+
 class AgentModel:
     """Base class of agent models: name the states and inputs, then write `drift` and `input_map`.
 
@@ -292,9 +301,7 @@ class AgentModel:
         object.__setattr__(self, "input_limit", limit)  # the library's models are frozen
 
     def _key(self) -> tuple[object, ...]:
-        return self.__class__, *(
-            (name, value.tobytes() if isinstance(value, np.ndarray) else value) for name, value in vars(self).items()
-        )
+        return self.__class__, *((name, _hashable(value)) for name, value in vars(self).items())
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, AgentModel) and self._key() == other._key())

@@ -254,3 +254,10 @@ class TestAsUsersWriteThem:
     def test_only_schedules_are_joined(self):
         with pytest.raises(TypeError):
             _ = Fixed() & 3
+
+    def test_a_schedule_of_ones_own_needs_a_part(self):
+        class Own(Schedule):
+            pass
+
+        with pytest.raises(NotImplementedError, match=r"Own has no part\(links, positions, number\)"):
+            Own().bind(Links.of(nx.path_graph(3)), np.zeros((3, 2), np.int64))
