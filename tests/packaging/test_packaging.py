@@ -26,10 +26,9 @@ def test_the_same_pythons_are_supported_and_tried():
     assert PROJECT["requires-python"] == f">={supported()[0]}"
     tests, wheel = (yaml.safe_load(path.read_text()) for path in WORKFLOWS if path.stem in ("tests", "wheel"))
     assert tests["jobs"]["test"]["strategy"]["matrix"]["python"] == supported()
-    chosen = [
-        step["with"]["python-version"] for step in wheel["jobs"]["wheel"]["steps"] if "python-version" in str(step)
-    ]
-    assert set(chosen[0].split()) == {supported()[0], supported()[-1]}
+    settings = [step.get("with", {}) for step in wheel["jobs"]["wheel"]["steps"]]
+    (chosen,) = [each["python-version"] for each in settings if "python-version" in each]
+    assert set(chosen.split()) == {supported()[0], supported()[-1]}
 
 
 @pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])

@@ -1,6 +1,6 @@
 """Install the wheel on the oldest and the newest supported Python found, without extras, and use it as a user would.
 
-Usage: try_wheel.py FOLDER, with one wheel and one source distribution in FOLDER; `make wheel` makes them and calls this.
+Usage: try_wheel.py FOLDER, where FOLDER has one wheel and one source distribution, as `make wheel` makes them.
 """
 
 import os
