@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test quick lint docs docs-open bench integrations dataset clean
+.PHONY: demo test quick lint docs docs-open wheel bench integrations dataset clean
 
 demo: .venv/core
 	$(BIN)/khop run paper
@@ -24,6 +24,12 @@ docs: .venv/docs
 
 docs-open: docs
 	$(BIN)/python -m http.server --bind 127.0.0.1 --directory docs/_build/html 8000
+
+# Wheel and source distribution in dist/, tried on the oldest and the newest supported Python found (a minute)
+wheel: .venv/build
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python tests/packaging/try_wheel.py dist
 
 # PEERS=1 installs what environments are compared with, each in an environment of its own (gigabytes, minutes)
 bench: .venv/bench $(if $(PEERS),.peers/mpe2/done .peers/vmas/done .peers/jaxmarl/done)
@@ -55,13 +61,17 @@ dataset: .venv/core
 	touch $@
 
 clean:
-	rm -rf .venv .peers runs
+	rm -rf .venv .peers runs dist docs/_build
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/core: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "khop_env needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
+	touch $@
+
+.venv/build: .venv/core
+	$(BIN)/python -m pip install --quiet -c constraints.txt 'build>=1.2'
 	touch $@
 
 .venv/test .venv/bench .venv/dev .venv/docs: .venv/%: .venv/core pyproject.toml constraints.txt
