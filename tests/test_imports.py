@@ -157,7 +157,8 @@ def test_import_khop_env_is_light() -> None:
 
 
 @pytest.mark.parametrize(
-    "statement", ["import khop_env.scenarios", "import agents", "import khop_env.simulation, khop_env.observers"]
+    "statement",
+    ["import khop_env.scenarios", "import agents, agents.learning", "import khop_env.simulation, khop_env.observers"],
 )
 def test_the_core_needs_no_extra(statement: str) -> None:
     """Building and running a scenario needs NumPy, networkx and Numba; heavy ones stay out until they are asked for."""
