@@ -35,6 +35,7 @@ nb_execution_cache_path = str(HERE / "_build" / "notebooks")
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # on a new machine the first cells say there that kernels are being compiled
 
 autodoc_default_options = {"members": True, "special-members": "__call__", "no-value": True}
 autodoc_member_order = "bysource"

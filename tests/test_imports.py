@@ -165,7 +165,12 @@ def test_import_khop_env_is_light() -> None:
 
 @pytest.mark.parametrize(
     "statement",
-    ["import khop_env.scenarios", "import agents", "import khop_env.simulation, khop_env.observers", STEPPING],
+    [
+        "import khop_env.scenarios",
+        "import agents, agents.learning",
+        "import khop_env.simulation, khop_env.observers",
+        STEPPING,
+    ],
 )
 def test_the_core_needs_no_extra(statement: str) -> None:
     """Running scenarios and environments needs NumPy, networkx, Gymnasium and Numba; others wait until they are used.
