@@ -29,7 +29,7 @@ from khop_env.observers.design import (
 from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.explicit import BatchedRightHandSide, Derivative, Explicit, FunnelError, RightHandSide
 from khop_env.observers.funnel_observers import FunnelObservers, LinksNow
-from khop_env.observers.known_estimators import ESTIMATORS, as_estimator, as_observers
+from khop_env.observers.known_estimators import ESTIMATORS, as_estimator
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays, PairLayout, TargetBlock
 from khop_env.observers.messages import MessagePassing
 from khop_env.observers.networked import Networked
@@ -85,7 +85,6 @@ __all__ = [
     "TargetBlock",
     "TargetObservers",
     "as_estimator",
-    "as_observers",
     "lower_bound",
     "predict",
 ]

@@ -25,9 +25,9 @@ from khop_env.observers import (
     Proximal,
     TargetObservers,
     as_estimator,
-    as_observers,
 )
 from khop_env.observers.design import design_rule_for
+from khop_env.observers.known_estimators import as_observers
 from khop_env.physics import AgentModel, Disturbance, Fleet, Links, check_task_graph, did_you_mean, validate_graph
 from khop_env.scenarios.bounds import check_bound, widened
 from khop_env.scenarios.parts import require_parts
