@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.evaluation import Episodes, chosen_scenario, play
+from agents.evaluation import Episodes, chosen_scenario, play, require_seeds
 from agents.outcomes import interval95, summary
 from agents.policies import Needs, make_policy, needs
 from agents.policy import EnvDescription, describe
@@ -21,6 +21,9 @@ from khop_env.brief import brief
 from khop_env.env import BatchedEnv
 from khop_env.observers import Networked
 from khop_env.registry import Environment, make_batched
+from khop_env.results.data_columns import DataColumn
+from khop_env.results.dataset import EpisodeDataset
+from khop_env.results.episodes import EpisodeRecorder, Part
 from khop_env.results.metrics import finite
 from khop_env.results.recording import Progress
 from khop_env.scenarios import Scenario
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
 CHUNK = 25  # episodes per batch; fixed, so that results don't depend on the number of workers
 
 _Task = tuple[str, Observe, Needs, str | None, tuple[int, ...]]  # policy, observation mode, its needs, network, seeds
+_Played = tuple[Episodes, list[Part]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +154,7 @@ def compare(
     ray: bool = False,
     arguments: Mapping[str, Any] | None = None,
     networks: Sequence[str] | None = None,
+    record: str | Path | EpisodeDataset | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
     """Run every policy under every observation mode over the same episodes.
@@ -166,19 +171,27 @@ def compare(
             with bounds in its observations, or is in a certified filter, always gets them.
         networks: names of networks, e.g. ["ideal", "lossy:loss=0.3"], in each of which everything is played; None for
             the one of `arguments` or the scenario.
+        record: a new folder, into which every step and every estimate is written, the same files for any number of
+            workers (docs/guides/datasets.md).
         progress: called with the completed fraction.
 
     Raises:
-        ValueError: if an argument is unknown or invalid, before the first episode.
+        ValueError: if an argument is unknown or invalid, or `record` is a folder with something in it, before the first
+            episode.
         ModuleNotFoundError: if `ray` is set and Ray isn't installed.
         UnfinishedError: if a policy or a worker fails; its `partial` holds the results until then.
         Interrupted: on Ctrl-C, with the same `partial`; the workers have ended.
     """
-    if not len(seeds):
-        raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
+    require_seeds(seeds)
     for name, names in (("policies", policies), ("observe", observe)):
         if isinstance(names, str):
             raise ValueError(f"{name} must be a list of names, e.g. [{names!r}]; got {names!r}")
+        for one in names:
+            if not isinstance(one, str):
+                raise ValueError(
+                    f"{name} must be names, which each process can look up; got {one!r}. For objects: "
+                    "evaluate(env, {'mine': policy}, seeds), or a file's, 'my_file.py:MyPolicy'"
+                )
     if not policies or not observe or len(set(observe)) < len(observe):
         raise ValueError(
             f"expected at least one policy and one observation mode, no mode twice; got policies={list(policies)} and "
@@ -186,6 +199,7 @@ def compare(
         )
     if networks is not None and (not networks or "network" in (arguments or {})):
         raise ValueError(f"networks must be names, and arguments without a network then; got networks={networks!r}")
+    dataset = EpisodeDataset(record) if isinstance(record, str | Path) else record
     player = _Player(environment, chosen_scenario(environment, scenario), arguments or {})
     rows: list[tuple[str, EnvDescription, Needs, str | None]] = []
     # check that each policy fits before the first episode
@@ -220,12 +234,24 @@ def compare(
                 result.rows.append(Row(spec, env, Episodes.joined(parts), over_network, networks is not None))
         return result
 
+    if dataset is not None:
+        named = environment if isinstance(environment, str) else rows[0][1].environment
+        every = [
+            (spec, network or player.network(env.observe, needed), player.environment(env.observe, needed, network))
+            for spec, env, needed, network in rows
+        ]
+        dataset.begin(named, every, seeds)
+        player.columns = dataset.columns
     try:
         with contextlib.closing(_run(player, tasks, workers, ray)) as played:
-            for done, (number, result) in enumerate(played, 1):
+            for done, (number, (result, parts)) in enumerate(played, 1):
+                if dataset is not None:
+                    dataset.write(number, parts)
                 results[number] = result
                 if progress is not None:
                     progress(done / len(tasks))
+        if dataset is not None:
+            dataset.finish()
     except KeyboardInterrupt:
         raise Interrupted(comparison()) from None
     except ModuleNotFoundError:
@@ -241,6 +267,7 @@ class _Player:
     def __init__(self, environment: Environment, scenario: Scenario, arguments: Mapping[str, Any]) -> None:
         self._environment, self._scenario, self._arguments = environment, scenario, dict(arguments)
         self._made: dict[tuple[Observe, Needs, str | None], BatchedEnv] = {}
+        self.columns: Mapping[str, DataColumn] | None = None  # of recorded steps; None: nothing is recorded
 
     def environment(self, observe: Observe, needed: Needs, network: str | None) -> BatchedEnv:
         """The environment, with num_envs = CHUNK, and what a policy needs unless the arguments say otherwise."""
@@ -259,9 +286,14 @@ class _Player:
         name = self._arguments.get("network")
         return name if isinstance(name, str) else observers.network.described()
 
-    def __call__(self, task: _Task) -> Episodes:
+    def __call__(self, task: _Task) -> _Played:
         spec, observe, needed, network, seeds = task
-        return play(self.environment(observe, needed, network), make_policy(spec), seeds, name=spec)
+        env, policy = self.environment(observe, needed, network), make_policy(spec)
+        if self.columns is None:
+            return play(env, policy, seeds, name=spec), []
+        parts: list[Part] = []
+        recorder = EpisodeRecorder(env, spec, network or self.network(observe, needed), self.columns)
+        return play(env, policy, seeds, name=spec, recorder=recorder, recorded=parts.extend), parts
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_made": {}}
@@ -269,7 +301,7 @@ class _Player:
 
 def _run(
     player: _Player, tasks: Sequence[_Task], workers: int, ray: bool
-) -> Generator[tuple[int, Episodes], None, None]:
+) -> Generator[tuple[int, _Played], None, None]:
     """Yield the index and result of each task in order of completion."""
     if ray:
         from agents.cluster import run_on_ray

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,8 @@ from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
 from khop_env.registry import Environment, find_task
 from khop_env.registry import scenario as load_scenario
+from khop_env.results.dataset import EpisodeDataset
+from khop_env.results.episodes import EpisodeRecorder, Part
 from khop_env.results.recording import Progress
 from khop_env.scenarios import Scenario
 
@@ -107,6 +110,7 @@ def evaluate(
     policies: Mapping[str, Policy] | Sequence[str],
     seeds: Sequence[int],
     *,
+    record: str | Path | EpisodeDataset | None = None,
     progress: Progress | None = None,
 ) -> pl.DataFrame:
     """Run every policy over the same episodes.
@@ -117,6 +121,7 @@ def evaluate(
         policies: policies by name, or a list of names understood by `make_policy`.
         seeds: one seed per episode; episodes of different policies with the same seed have the same initial states,
             disturbances and leaders, so that differences can be paired.
+        record: a new folder, into which every step and every estimate is written (docs/guides/datasets.md).
         progress: called with the completed fraction.
 
     Returns:
@@ -125,7 +130,8 @@ def evaluate(
 
     Raises:
         TypeError: if `env` is no environment of khop_env, or a policy lacks `reset` or `act`.
-        ValueError: if a policy is unknown, `seeds` is empty, or the environment rejects an action.
+        ValueError: if a policy is unknown, `seeds` is empty, the environment rejects an action, or `record` is a folder
+            with something in it.
     """
     import polars as pl
 
@@ -136,16 +142,30 @@ def evaluate(
         )
     chosen = policies if isinstance(policies, Mapping) else {spec: make_policy(spec) for spec in policies}
     description = describe(batched)
-    frames = []
+    dataset = EpisodeDataset(record) if isinstance(record, str | Path) else record
+    if dataset is not None:
+        dataset.begin(description.environment, [(name, None, batched) for name in chosen], seeds)
+    frames, batches = [], itertools.count()
     for number, (name, policy) in enumerate(chosen.items()):
         partial = None if progress is None else lambda part, n=number: progress((n + part) / len(chosen))
-        episodes = play(batched, policy, seeds, name=name, progress=partial)
+        recorder = None if dataset is None else EpisodeRecorder(batched, name, columns=dataset.columns)
+        written = None if dataset is None else lambda parts: dataset.write(next(batches), parts)
+        episodes = play(batched, policy, seeds, name=name, progress=partial, recorder=recorder, recorded=written)
         frames.append(episodes.frame(name, description))
+    if dataset is not None:
+        dataset.finish()
     return pl.concat(frames)
 
 
 def play(
-    env: object, policy: Policy, seeds: Sequence[int], *, name: str = "policy", progress: Progress | None = None
+    env: object,
+    policy: Policy,
+    seeds: Sequence[int],
+    *,
+    name: str = "policy",
+    progress: Progress | None = None,
+    recorder: EpisodeRecorder | None = None,
+    recorded: Callable[[list[Part]], None] | None = None,
 ) -> Episodes:
     """Run one policy, num_envs episodes at a time.
 
@@ -155,6 +175,8 @@ def play(
         seeds: one seed per episode.
         name: the policy's name in error messages.
         progress: called with the completed fraction.
+        recorder: of this environment.
+        recorded: called with the recorder's tables after every num_envs episodes.
 
     Raises:
         TypeError: if `env` is no environment of khop_env, or the policy lacks `reset` or `act`.
@@ -162,22 +184,23 @@ def play(
     """
     batched = batched_of(env)
     _require_policy(policy, name)
-    if not len(seeds):
-        raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
+    require_seeds(seeds)
     parts = []
     for first in range(0, len(seeds), batched.num_envs):
         chunk = [int(seed) for seed in seeds[first : first + batched.num_envs]]
         filled = chunk + [chunk[-1]] * (batched.num_envs - len(chunk))
         try:
-            parts.append(_play(batched, policy, filled, len(chunk)))
+            parts.append(_play(batched, policy, filled, len(chunk), recorder))
         except ValueError as error:
             raise ValueError(f"policy {name!r} in {batched.task.environment}: {error}") from error
+        if recorder is not None and recorded is not None:
+            recorded(recorder.end())
         if progress is not None:
             progress(min(1.0, (first + batched.num_envs) / len(seeds)))
     return Episodes.joined(parts)
 
 
-def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Episodes:
+def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int, recorder: EpisodeRecorder | None) -> Episodes:
     """Run one batch of episodes and keep the first `count`."""
     horizon, period = env.settings.horizon, env.settings.control_period
     error, returns, effort = np.zeros((horizon + 1, env.num_envs)), np.zeros(env.num_envs), np.zeros(env.num_envs)
@@ -185,12 +208,17 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
     inputs = np.array([env.fleet.models[env.fleet.agent(agent)].m for agent in env.agents])
     policy.reset(describe(env), policy_seeds(seeds))
     observations, infos = env.reset(seeds)
+    if recorder is not None:
+        recorder.begin(seeds[:count], observations)
     error[0] = infos["task_error"].mean(axis=1)
     outcomes = Outcomes(env, infos)
     running, length = np.ones(env.num_envs, bool), np.full(env.num_envs, horizon)
     for cycle in range(1, horizon + 1):
         actions = _by_agent(env, policy.act(by_agent(env, observations)))
-        observations, reward, terminated, truncated, infos = env.step(np.concatenate(list(actions.values()), axis=1))
+        flat = np.concatenate(list(actions.values()), axis=1)
+        observations, reward, terminated, truncated, infos = step = env.step(flat)
+        if recorder is not None:
+            recorder.add(flat, step)
         returns += np.where(running, reward.mean(axis=1), 0.0)
         squared = [
             np.square(np.clip(actions[agent][:, :m], -1.0, 1.0, dtype=np.float64)).sum(axis=1)
@@ -231,6 +259,18 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int) -> Epis
         time=period * np.arange(horizon + 1.0),
         outcomes={key: values[:count] for key, values in outcomes.result().items()},
     )
+
+
+def require_seeds(seeds: Sequence[int]) -> None:
+    """Refuse seeds that aren't one per episode.
+
+    Raises:
+        ValueError: if there are none, or it isn't a sequence.
+    """
+    if not hasattr(seeds, "__len__"):
+        raise ValueError(f"seeds must be one per episode, e.g. range(100); got {seeds!r}")
+    if not len(seeds):
+        raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
 
 
 def _require_policy(policy: object, name: str) -> None:

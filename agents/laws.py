@@ -21,6 +21,7 @@ LAWS: dict[str, Callable[..., Law]] = {
     "formation": FormationLaw,
     "leader_following": LeaderFollowingLaw,
 }
+"""Feedback laws by name."""
 
 
 class LawError(ValueError):

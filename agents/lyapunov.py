@@ -1,4 +1,7 @@
-"""The set-ISS gain of consensus laws, from V = |e|^2 / 2 with e = Pi x the disagreement of the positions."""
+"""The set-ISS gain of consensus laws, from V = |e|^2 / 2 with e = Pi x the disagreement of the positions.
+
+docs/theory/set_iss.md has the derivation, term by term.
+"""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Policy(Protocol):
 
 
 def describe(env: object) -> EnvDescription:
-    """The static description of an environment of any kind that `batched_of` accepts."""
+    """The static description of an environment of any kind of this library, wrapped or not."""
     batched = batched_of(env)
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
     disturbance = batched.simulator.disturbance

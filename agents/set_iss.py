@@ -1,4 +1,4 @@
-"""Measurement of Theorem 4: the distance at which estimation errors keep the team from its goal set.
+"""Measurement of Theorem 4 (docs/theory/set_iss.md): the distance at which errors keep a team from its goal set.
 
 Two experiments on a scenario's closed loop, whose goal set A is agreement of the positions:
 

@@ -41,6 +41,19 @@ DT = 0.01
 EXPLICIT_DT = 1e-5
 BATCH = 64
 ROOT = Path(__file__).resolve().parents[1]  # of the repository
+PARTS = (
+    "explicit",
+    "scipy",
+    "solve",
+    "growth",
+    "environments",
+    "network",
+    "violations",
+    "filter",
+    "collisions",
+    "training",
+)
+"""Keys of the parts, in the order in which they are measured."""
 SCIPY_ROWS = ("speedup_vs_scipy", "speedup_vs_scipy_batch")
 Progress = Callable[[str], None]
 
@@ -50,65 +63,103 @@ class Part:
     """Some rows of the table.
 
     Attributes:
+        key: of `--only`.
         name: name of the measurement.
+        minutes: how long it takes on two cores, about.
         measure: measures and adds the rows.
         needs: required packages that aren't dependencies of the core.
         rows: names of the rows that need these packages.
     """
 
+    key: str
     name: str
+    minutes: float
     measure: Callable[[], None]
     needs: tuple[str, ...] = ()
     rows: tuple[str, ...] = ()
 
 
-def benchmark(quick: bool = False, progress: Progress | None = None, peers: Path | None = None) -> dict[str, Any]:
+def benchmark(
+    quick: bool = False,
+    progress: Progress | None = None,
+    peers: Path | None = None,
+    only: Sequence[str] | None = None,
+) -> dict[str, Any]:
     """Run all benchmarks; parts without their packages are left out, and an interrupt returns the rows until then.
 
     Args:
         quick: whether to do a hundredth of the work, as a test; the values mean little.
         progress: called with a line for each part that is left out, and then before each part.
         peers: folder with virtual environments of other libraries to compare with; None for no comparison.
+        only: keys of the parts to run, see `PARTS`; by default all.
 
     Returns:
         "machine"; "rows", see `Report`; "failed", the parts that ended with an error; and "interrupted".
 
     Raises:
-        ValueError: if `peers` has no virtual environment of a peer.
+        ValueError: if `peers` has no virtual environment of a peer, or a part is unknown.
     """
     say = progress or (lambda line: None)
     report = Report()
-    parts = (
-        Part("proximal against explicit, closed loop of `paper`", partial(_against_explicit, report.add, quick)),
+    parts: tuple[Part, ...] = (
         Part(
+            "explicit",
+            "proximal against explicit, closed loop of `paper`",
+            1.0,
+            partial(_against_explicit, report.add, quick),
+        ),
+        Part(
+            "scipy",
             "proximal against SciPy's stiff solvers",
+            1.0,
             partial(_against_scipy, report, quick, say),
             needs=("scipy",),
             rows=SCIPY_ROWS,
         ),
         Part(
+            "solve",
             "the solve against its bare arithmetic",
-            lambda: report.add("ratio_to_floor", _ratio_to_floor(quick), target="at most 6"),
+            0.2,
+            lambda: report.add("ratio_to_floor", _ratio_to_floor(quick), most=6.0),
         ),
-        Part("growth with the number of agents", partial(_growth, report.add, quick, say)),
-        Part("environments", partial(environment_rows, report, quick, say, peers)),
-        Part("environments over a network, against continuous exchange", partial(network_rows, report, quick)),
-        Part("errors against certified bounds", partial(violation_rows, report, quick)),
-        Part("the safety filter", partial(speed_rows, report, quick)),
-        Part("collisions under the safety filter", partial(collision_rows, report, quick)),
+        Part("growth", "growth with the number of agents", 1.0, partial(_growth, report.add, quick, say)),
         Part(
+            "environments",
+            "environments",
+            1.0 if peers is None else 5.0,
+            partial(environment_rows, report, quick, say, peers),
+        ),
+        Part(
+            "network",
+            "environments over a network, against continuous exchange",
+            0.5,
+            partial(network_rows, report, quick),
+        ),
+        Part("violations", "errors against certified bounds", 2.0, partial(violation_rows, report, quick)),
+        Part("filter", "the safety filter", 0.5, partial(speed_rows, report, quick)),
+        Part("collisions", "collisions under the safety filter", 2.0, partial(collision_rows, report, quick)),
+        Part(
+            "training",
             "training: PPO, 64 environments of 8 agents",
+            0.5 if peers is None else 2.0,
             partial(training_rows, report, quick, peers),
             needs=("stable_baselines3", "torch"),
             rows=("training", "training_environment_share"),
         ),
     )
+    if only is not None:
+        if unknown := [key for key in only if key not in PARTS]:
+            raise ValueError(f"unknown part {unknown[0]!r} of the benchmark; the parts are {', '.join(PARTS)}")
+        parts = tuple(part for part in parts if part.key in only)
     missing = {part.name: [name for name in part.needs if not _installed(name)] for part in parts}
     for part in parts:
         if missing[part.name]:
             say(f"left out: {part.name} ({_to_install(missing[part.name])})")
     for line in left_out(peers):
         say(f"left out: {line}")
+    if not quick:
+        minutes = sum(part.minutes for part in parts if not missing[part.name])
+        say(f"this takes about {minutes:.0f} minutes on two cores; Ctrl-C ends it with the rows until then")
     failed, interrupted = [], False
     try:
         for part in parts:
@@ -175,8 +226,8 @@ def _against_explicit(add: Callable[..., None], quick: bool) -> None:
     fine = 20
     reference = _trajectory(DT / fine, duration, every=fine)
     error = np.abs(_trajectory(DT, duration) - reference).max()
-    add("proximal_error", error, "m", f"at most {ACCURACY:g}")
-    for batch, suffix, target in ((BATCH, "", "at least 60, aim 100"), (1, "_single", "at least 25")):
+    add("proximal_error", error, "m", most=ACCURACY)
+    for batch, suffix, least in ((BATCH, "", 100.0), (1, "_single", 25.0)):
         simulator = _simulator(paper(), batch)
         _run(simulator, DT, 10 * DT)
         proximal = _best(partial(_run, simulator, DT, duration), 2 if batch > 1 else 5) / duration
@@ -185,10 +236,10 @@ def _against_explicit(add: Callable[..., None], quick: bool) -> None:
         loop.run(EXPLICIT_DT, 10)
         steps = 200 if quick else (20_000 if batch > 1 else 200_000)  # of equal cost, so a part of the 10 s is enough
         explicit = _best(partial(loop.run, EXPLICIT_DT, steps), 2) / (steps * EXPLICIT_DT)
-        add(f"speedup_vs_explicit{suffix}", explicit / proximal, target=target)
+        add(f"speedup_vs_explicit{suffix}", explicit / proximal, least=least)
         elements = 2 * simulator.design.states.layout.size * batch  # state and input observers
         bare = _bare_time(elements, steps) / (steps * EXPLICIT_DT)
-        add(f"explicit_to_floor{suffix}", explicit / bare, target="at most 2" if batch > 1 else "")
+        add(f"explicit_to_floor{suffix}", explicit / bare, most=2.0 if batch > 1 else None)
         add(f"proximal{suffix}", proximal / batch * 1e3, "ms per environment and simulated s")
         add(f"explicit{suffix}", explicit / batch * 1e3, "ms per environment and simulated s")
 
@@ -241,7 +292,7 @@ def _against_scipy(report: Report, quick: bool, say: Progress) -> None:
         for name in SCIPY_ROWS:
             report.skip(name, f"no solver kept the error below {ACCURACY:g}")
         return
-    report.add("speedup_vs_scipy", best / ours, target="at least 20, aim 50")
+    report.add("speedup_vs_scipy", best / ours, least=3.0)
     report.add("speedup_vs_scipy_batch", best / ours_many)
 
 
@@ -293,11 +344,11 @@ def _growth(add: Callable[..., None], quick: bool, say: Progress) -> None:
         add(f"memory_{agents}", held[index] / pairs[index], "bytes per pair")
     for name, values in (("growth_time", seconds), ("growth_memory", held)):
         per_pair = np.array(values) / pairs
-        add(name, per_pair.max() / per_pair.min(), target="at most 1.5")
+        add(name, per_pair.max() / per_pair.min(), most=1.5)
     say(f"memory of a process with {sizes[-1]} agents")
     script = f"from benchmarks.benchmark import peak_memory; print(peak_memory({sizes[-1]}))"
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
-    add(f"peak_{sizes[-1]}", float(done.stdout.split()[-1]) / 2**20, "MiB", "below 1024")
+    add(f"peak_{sizes[-1]}", float(done.stdout.split()[-1]) / 2**20, "MiB", most=1024.0)
 
 
 def _steps(simulator: Simulator, count: int) -> None:

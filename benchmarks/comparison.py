@@ -42,7 +42,7 @@ def compare(
     ours: Callable[[], float],
     theirs: Callable[[Path], float],
     peer: tuple[Path | None, str],
-    ratio: tuple[str, str],
+    ratio: tuple[str, float | None],
     turns: int,
 ) -> None:
     """Add the row `name`, the median of `ours`, and `name`_ratio where ratios were asked for.
@@ -54,7 +54,7 @@ def compare(
         ours: measures this library once.
         theirs: measures the peer once, with the Python of its virtual environment.
         peer: folder of the virtual environments, or None for no ratios; and the peer's name.
-        ratio: unit and target of the ratio.
+        ratio: unit of the ratio, and its target: at least so much, or None.
         turns: number of alternating measurements of both sides, so that the load of the machine affects both; 1 without
             a peer.
     """
@@ -75,7 +75,7 @@ def compare(
     if missing is not None:
         report.skip(f"{name}_ratio", missing)
     elif others:
-        report.add(f"{name}_ratio", statistics.median(own) / statistics.median(others), *ratio)
+        report.add(f"{name}_ratio", statistics.median(own) / statistics.median(others), ratio[0], least=ratio[1])
 
 
 def run_peer(python: Path, script: str, *arguments: float, threads: int = 1) -> float:

@@ -115,17 +115,17 @@ def environment_rows(report: Report, quick: bool, say: Callable[[str], None], pe
         return lambda s: vector_rate(s, scenario, order, threads, batch)
 
     vmas = f"VMAS simple_spread, batch {batch}"
-    plan: list[tuple[str, str, Rate, str, int, int, str]] = [
-        (f"single_order{order}", "MPE2 simple_spread", _single(order), "mpe2", 1, 1, "at least 8" if order == 1 else "")
+    plan: list[tuple[str, str, Rate, str, int, int, float | None]] = [
+        (f"single_order{order}", "MPE2 simple_spread", _single(order), "mpe2", 1, 1, 8.0 if order == 1 else None)
         for order in (1, 2)
     ]
     for scenario in ("paper", "convoy"):
         for order in (1, 2):
-            wanted = "at least 2" if order == 1 else ""
+            wanted = 2.0 if order == 1 else None
             plan.append((f"vector_{scenario}_order{order}", vmas, ours(scenario, order, 1), "vmas", batch, 1, wanted))
-        plan.append((f"vector_{scenario}_threads2", vmas, ours(scenario, 1, 2), "vmas", batch, 2, ""))
+        plan.append((f"vector_{scenario}_threads2", vmas, ours(scenario, 1, 2), "vmas", batch, 2, None))
         name = f"JaxMARL simple_spread, batch {batch}, a step a call: our one thread against XLA's own pool"
-        plan.append((f"vector_{scenario}_jax", name, ours(scenario, 1, 1), "jaxmarl", batch, 1, "aim 1"))
+        plan.append((f"vector_{scenario}_jax", name, ours(scenario, 1, 1), "jaxmarl", batch, 1, 1.0))
     for name, peer_name, rate, peer, size, threads, target in plan:
         say(f"environments: {name}")
         compare(

@@ -15,10 +15,12 @@ from pathlib import Path
 from agents.learning import PRETRAINED, TrainingConfig, pretrained_name
 from agents.learning.training import EVALUATION_SEEDS
 from agents.policy import describe
+from benchmarks.publish import commit
 from benchmarks.study import EPISODES, SEEDS, TASKS, folder_of, largest_ratio, measure, table, train_all
 from khop_env.registry import make_batched
 from khop_env.results import learning_curves
 
+BY_HAND = "<!-- what follows is written by hand -->"
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--root", type=Path, default=Path("runs/study"), help="folder of the runs")
 parser.add_argument("--workers", type=int, default=2, help="processes")
@@ -37,11 +39,11 @@ def main() -> None:
     budgets = ", ".join(f"{task.timesteps / 1e6:g} million on {task.label}" for task in TASKS)
     text = [
         "# Learned policies, measured\n",
-        f"Written by `python -m benchmarks.publish_table` on {date.today().isoformat()}: {len(SEEDS)} training "
-        f"seeds for each kind of observation, {len(EPISODES)} evaluation episodes, the same for every row and other "
-        f"than those that policies were trained, selected or tuned on. The trainings took {hours:.1f} hours of wall "
-        f"time added up, {options.workers} at a time on {os.cpu_count()} shared cores ({platform.machine()}, no GPU); "
-        f"agent-steps of each run: {budgets}. The evaluated policy of each run is the best of "
+        f"Written by `python -m benchmarks.publish_table` on {date.today().isoformat()}, {commit()}: {len(SEEDS)} "
+        f"training seeds for each kind of observation, {len(EPISODES)} evaluation episodes, the same for every row and "
+        f"other than those that policies were trained, selected or tuned on. The trainings took {hours:.1f} hours of "
+        f"wall time added up, {options.workers} at a time on {os.cpu_count()} shared cores ({platform.machine()}, no "
+        f"GPU); agent-steps of each run: {budgets}. The evaluated policy of each run is the best of "
         f"{TrainingConfig('consensus_v0').evaluations} evaluations on {len(EVALUATION_SEEDS)} further episodes.\n",
         "Returns are means over agents of an episode's sum; ± is the 95 % interval over episodes, of learned policies "
         "after averaging over training seeds. Scripts have the parameters that `khop tune` found for the "
@@ -62,7 +64,7 @@ def main() -> None:
     for path in (page, figure):
         path.parent.mkdir(parents=True, exist_ok=True)
     written = page.read_text(encoding="utf-8") if page.exists() else ""
-    by_hand = "".join(written.partition("\n## ")[1:])  # sections of this level stay
+    by_hand = "".join(written.partition(f"\n{BY_HAND}")[1:])  # stays
     page.write_text("\n".join(text).rstrip() + "\n" + by_hand, encoding="utf-8")
     curves = {block.task.label: (block.timesteps, block.curves) for block in blocks}
     learning_curves(curves, figure)

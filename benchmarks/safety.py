@@ -234,8 +234,13 @@ def collision_rows(report: Report, quick: bool) -> None:
     counts = list(collisions(20, durations={8: 3.0})) if quick else list(collisions(1000))
     for name, found in totals(counts).items():
         certified = name == "certified"
-        report.add(f"collisions_{name}", found["collisions"], f"of {found['episodes']} episodes", "0" * certified)
-        report.add(f"min_distance_{name}", found["min_distance"], "m", "at least 0.4" * certified)
+        report.add(
+            f"collisions_{name}",
+            found["collisions"],
+            f"of {found['episodes']} episodes",
+            most=0.0 if certified else None,
+        )
+        report.add(f"min_distance_{name}", found["min_distance"], "m", least=0.4 if certified else None)
 
 
 def print_counts(counts: Sequence[Count]) -> None:

@@ -203,7 +203,7 @@ def measure(
 
 def table(block: Block) -> Iterator[str]:
     """The block in Markdown: means, intervals over episodes, spread over seeds, and the guarantee."""
-    yield f"### {block.task.label}\n"
+    yield f"## {block.task.label}\n"
     yield f"Bounds on estimates fall at {rates_of(block.task.scenario)} 1/s.\n"
     yield "| policy | return | spread over seeds | error at the end (m) | largest \\|e\\| | after the transient |"
     yield "|---|---|---|---|---|---|"

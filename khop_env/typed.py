@@ -60,7 +60,8 @@ def environment_types(task: Task | type[Task]) -> dict[str, Any]:
         except (NameError, TypeError):  # of a user's own that can't be evaluated here
             continue
     of_task = {each.name: hints.get(each.name, Any) for each in parameters}
-    arrays = {name for name, kind in of_task.items() if {*get_args(ArrayLike)} <= {*get_args(kind), kind}}
+    members = {*(get_args(ArrayLike) or [ArrayLike])}  # from NumPy 2.5 on it is the name of a union, not a union
+    arrays = {name for name, kind in of_task.items() if members <= {*get_args(kind), kind}}
     return of_task | dict.fromkeys(arrays, list | None) | get_type_hints(Settings)
 
 

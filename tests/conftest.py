@@ -42,6 +42,7 @@ SLOW = tuple(
         "env/test_integrations.py::TestSuperSuit::test_ppo",
         "env/test_sb3.py::test_ppo",
         # processes, one or more per test
+        "agents/test_datasets.py::test_recording_changes_nothing",
         "agents/test_workers.py",
         "deploy/test_lockstep.py::test_processes",
         "deploy/test_policies.py::test_real_processes",

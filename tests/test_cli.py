@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import khop_env
+from benchmarks.report import Report
 from khop_env import __version__
 from khop_env.catalog import ENVIRONMENTS
 from khop_env.cli import COMMANDS, app
@@ -376,13 +377,15 @@ class TestExport:
 class TestBench:
     @pytest.fixture(autouse=True)
     def stand_in(self, monkeypatch):
-        def benchmark(quick=False, progress=None, peers=None):
+        def benchmark(quick=False, progress=None, peers=None, only=None):
             progress("measuring")
-            speedup = {"name": "speedup", "value": 61.234567, "unit": "x", "target": ">= 60", "skipped": None}
-            rows = [speedup] + [
-                {"name": name, "value": None, "unit": "", "target": "", "skipped": "needs scipy"} for name in "ab"
-            ]
-            return {"rows": rows, "machine": "here", "quick": quick, **self.ended}
+            report = Report()
+            report.add("training", 61.234567, "agent-steps/s", least=60.0)
+            report.add("training_ratio", 2.5, least=3.0)
+            for name in "ab":
+                report.skip(name, "needs scipy")
+            rows = [row for row in report.rows if only is None or row["name"] in only]
+            return {"rows": rows, "machine": {"cores": 2}, "quick": quick, **self.ended}
 
         self.ended = {"failed": [], "interrupted": False}
         module = types.ModuleType("benchmarks.benchmark")
@@ -391,9 +394,12 @@ class TestBench:
 
     def test_table(self):
         result = khop("bench")
-        assert "speedup" in result.stdout
-        assert "61.23" in result.stdout
         assert result.stderr == "measuring\n"
+        lines = [" ".join(line.split()) for line in result.stdout.splitlines()]
+        assert "training 61.23 agent-steps/s at least 60" in lines
+        assert "training_ratio 2.5 x at least 3: MISSED" in lines
+        assert "training: PPO, 64 environments of 8 agents, inside `learn`" in lines
+        assert lines[-1] == "machine: cores 2"
         assert [line.split() for line in result.stdout.splitlines() if "skipped" in line] == [
             ["a", "skipped"],
             ["b", "skipped"],
@@ -403,7 +409,12 @@ class TestBench:
     def test_json(self):
         found = only_json(khop("bench", "--json", "--quick"))
         assert found["quick"] is True
-        assert [row["skipped"] for row in found["rows"]] == [None, "needs scipy", "needs scipy"]
+        assert [row["skipped"] for row in found["rows"]] == [None, None, "needs scipy", "needs scipy"]
+        assert [row["met"] for row in found["rows"]] == [True, False, None, None]
+
+    def test_parts(self):
+        found = only_json(khop("bench", "--json", "--only", "training, b"))
+        assert [row["name"] for row in found["rows"]] == ["training", "b"]
 
     @pytest.mark.parametrize(
         ("ended", "status"),
@@ -413,7 +424,7 @@ class TestBench:
     def test_what_was_measured_is_printed_however_it_ends(self, ended, status):
         self.ended |= ended
         assert "61.23" in khop("bench", status=status).stdout
-        assert len(only_json(khop("bench", "--json", status=status))["rows"]) == 3
+        assert len(only_json(khop("bench", "--json", status=status))["rows"]) == 4
 
     def test_a_wheel_is_without_it(self, monkeypatch, tmp_path):
         monkeypatch.setattr("khop_env.commands.bench.REPOSITORY", tmp_path)

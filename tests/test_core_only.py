@@ -1,4 +1,4 @@
-"""Every command of the README in the core installation, without any extra: it works, or names what to install."""
+"""Commands of the README and docs/guides/commands.md in the core installation: each works, or names its extra."""
 
 import json
 import os
@@ -12,6 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 EXTRAS = ("scipy", "torch", "tensorboard", "stable_baselines3", "supersuit", "pygame", "imageio_ffmpeg", "ray", "zenoh")
+EXTRAS += ("minari",)
 SHORTER = {  # what makes a command take seconds; the code that it runs is the same
     "khop run": "--duration 0.05",
     "khop run paper --integrator explicit": "--duration 0.0005",
@@ -30,8 +31,8 @@ NEEDS = {  # what is refused, and the extra that the refusal names
 
 
 def commands() -> list[str]:
-    """The README's commands, in code blocks and in backquotes, ENV being one of the environments."""
-    text = (ROOT / "README.md").read_text()
+    """The commands of both pages, in code blocks and in backquotes, ENV being one of the environments."""
+    text = "".join((ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "docs/guides/commands.md"))
     lines = re.findall(r"^(?:\.venv/bin/)?(khop [^#\n]*)", text, flags=re.MULTILINE)
     found = [*lines, *re.findall(r"`(khop [a-z]+(?: [^`]+)?)`", text)]
     # a policy has to be trained before it can be played
@@ -56,7 +57,7 @@ def core(tmp_path_factory):
     return python
 
 
-def test_the_readme_names_every_command():
+def test_the_pages_name_every_command():
     named = {one.split()[1] for one in commands()}
     rest = {"evaluate", "train", "tune", "iss", "network", "deploy", "test", "bench"}
     assert named == {"list", "check", "run", "export", *rest}

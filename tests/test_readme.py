@@ -10,16 +10,12 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_the_readmes_python_runs(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # one snippet writes below runs/
+    monkeypatch.chdir(tmp_path)
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
-    said = []
+    assert snippets
     for snippet in snippets:
-        snippet = snippet.replace("learn(1_000_000)", "learn(10_000)")  # 20 s of training are too long here
         exec(compile(snippet, "README.md", "exec"), {})
-        said.append(capsys.readouterr().out)
-    assert len(snippets) == 7
-    assert all(said)
-    assert "largest |xi| / rho: 0." in said[-1]
+    assert "bound.x1" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.name)
@@ -35,6 +31,11 @@ def test_the_replay_refuses_a_folder_without_a_run(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", [str(path), str(tmp_path / "nofolder")])
     with pytest.raises(SystemExit, match=r"nofolder isn't the folder of a khop run: it has no summary\.json and no st"):
         runpy.run_path(str(path), run_name="__main__")
+
+
+def test_the_readme_is_short():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 130, "what a newcomer needs within a minute; everything else is in docs"
 
 
 def test_ci_calls_the_readmes_test_command():

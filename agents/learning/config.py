@@ -17,6 +17,7 @@ from khop_env.simulation import OBSERVE, Observe
 
 Algorithm = Literal["ppo", "sac"]
 ALGORITHMS = ("ppo", "sac")
+"""Algorithms of `khop train`."""
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},

@@ -16,6 +16,7 @@ from agents.policy import EnvDescription, Observations
 from khop_env.env.layout import Float32Array
 
 PRETRAINED = Path(__file__).with_name("pretrained")
+"""Folder of the policies that come with the library."""
 
 
 @dataclass(eq=False)

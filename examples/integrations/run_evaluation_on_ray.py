@@ -1,4 +1,7 @@
-"""`khop evaluate --ray` gives the numbers of one machine; in an environment of its own (make integrations)."""
+"""`khop evaluate --ray` gives numbers and files of one machine; in an environment of its own (make integrations)."""
+
+import tempfile
+from pathlib import Path
 
 from agents import compare
 
@@ -8,8 +11,12 @@ arguments = {
     "scenario": "mixed_fleet",
     "seeds": range(60),
 }
-here = compare("consensus_v0", **arguments)
-there = compare("consensus_v0", **arguments, ray=True)
+with tempfile.TemporaryDirectory() as folder:
+    roots = Path(folder, "here"), Path(folder, "there")
+    here = compare("consensus_v0", **arguments, record=roots[0])
+    there = compare("consensus_v0", **arguments, record=roots[1], ray=True)
+    files = [{str(file.relative_to(root)): file.read_bytes() for file in root.rglob("*.parquet")} for root in roots]
+assert files[0] == files[1]
 assert here.summary() == there.summary()
 assert here.frame().equals(there.frame())
 print("on Ray as on one machine:")

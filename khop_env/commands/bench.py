@@ -22,6 +22,13 @@ def bench(
         Path | None,
         typer.Option(help="Folder of virtual environments (mpe2, vmas, jaxmarl) with libraries to compare with."),
     ] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            help="Parts: explicit,scipy,solve,growth,environments,network,violations,filter,collisions,training; by "
+            "default all."
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure speed and memory against explicit, SciPy's and bare loops, and other libraries' environments.
@@ -30,16 +37,20 @@ def bench(
     printed.
     """
     with mistakes():
-        result = _benchmark()(quick=quick, progress=say, peers=peers)
+        parts = None if only is None else [part.strip() for part in only.split(",")]
+        result = _benchmark()(quick=quick, progress=say, peers=peers, only=parts)
     if as_json:
         print_json(result)
     else:
-        rows = [(row["name"], _value(row), row["unit"], row["target"]) for row in result["rows"]]
+        rows = [(row["name"], _value(row), row["unit"], _target(row)) for row in result["rows"]]
         print_table(("measure", "value", "unit", "target"), rows)
+        for text in dict.fromkeys(row["explanation"] for row in result["rows"] if row["explanation"]):
+            names = ", ".join(row["name"] for row in result["rows"] if row["explanation"] == text)
+            print_text(f"{names}: {text}")
         for reason in dict.fromkeys(row["skipped"] for row in result["rows"] if row["skipped"] is not None):
             names = ", ".join(row["name"] for row in result["rows"] if row["skipped"] == reason)
             print_text(f"skipped: {names}: {reason}")
-        print_text(f"machine: {result['machine']}")
+        print_text("machine: " + ", ".join(f"{name} {value}" for name, value in result["machine"].items()))
     if result["interrupted"]:
         say("khop: interrupted; the rows that are missing weren't measured")
         raise typer.Exit(INTERRUPTED)
@@ -57,6 +68,10 @@ def _benchmark() -> Callable[..., dict[str, Any]]:
     from benchmarks.benchmark import benchmark
 
     return benchmark
+
+
+def _target(row: dict[str, Any]) -> str:
+    return f"{row['target']}{'' if row['met'] is not False else ': MISSED'}"
 
 
 def _value(row: dict[str, Any]) -> str:

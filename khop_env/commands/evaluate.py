@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -66,6 +67,21 @@ def evaluate(
     workers: Annotated[int, typer.Option(min=1, help="Processes; the numbers don't depend on how many.")] = 1,
     ray: Annotated[bool, typer.Option("--ray", help="Play on a Ray cluster.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Draw the task error over time into this image file.")] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Write every step, true state, action, estimate and bound into this new folder, as Parquet files.",
+        ),
+    ] = None,
+    minari: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME-vN",
+            help="With --record: also write a Minari data set of the whole team as one agent; of one observation mode "
+            "and network.",
+        ),
+    ] = None,
     csv: Annotated[bool, typer.Option("--csv", help="Print a line per episode instead of the table.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -78,6 +94,8 @@ def evaluate(
     from agents.workers import Interrupted, UnfinishedError
     from khop_env.objects import split_specs
     from khop_env.registry import find_task
+    from khop_env.results.dataset import EpisodeDataset
+    from khop_env.results.minari_dataset import require_new, write_minari
     from khop_env.typed import environment_arguments
 
     unfinished: tuple[str, int] | None = None  # why, and the exit status
@@ -96,6 +114,22 @@ def evaluate(
         if observe is None:
             bounded = any(needs(make_policy(name)).bounds for name in names)
             observe = "estimate" if bounded else "estimate,oracle,local"
+        if minari is not None:
+            if record is None:
+                raise ValueError(f"--minari {minari} is made from a recording: name its folder with --record DIR")
+            if "," in observe or len(networks) > 1:
+                raise ValueError(
+                    f"--minari {minari} is of one environment: choose one mode with --observe (got {observe}) and one "
+                    "network"
+                )
+            require_new(minari)
+        dataset = None
+        if record is not None:
+            options: dict[str, object] = {"scenario": scenario, "policies": policies, "observe": observe}
+            options |= {"network": network, "estimator": estimator, "shield": shield}
+            options |= {"episodes": episodes, "seed": seed, "record": record}
+            command = _command(environment, options, env or ())
+            dataset = EpisodeDataset(record, command=command, scenario=scenario)
         with Progress(f"playing {environment}") as progress:
             try:
                 comparison = compare(
@@ -108,6 +142,7 @@ def evaluate(
                     seeds=range(seed, seed + episodes),
                     workers=workers,
                     ray=ray,
+                    record=dataset,
                     progress=progress,
                 )
             except Interrupted as error:
@@ -118,10 +153,30 @@ def evaluate(
         _print(comparison, csv, as_json)
         if figure is not None:
             _draw(comparison, figure)
+    if dataset is not None:
+        steps, estimates = dataset.rows.values()
+        say(
+            f"recorded: {dataset.folder}, {steps} rows of steps and {estimates} of estimates, "
+            f"{dataset.size() / 1e6:.1f} MB"
+        )
+        if minari is not None and unfinished is None:
+            with mistakes(), waiting(f"writing {minari}"):
+                written = write_minari(dataset.folder, minari)
+            say(f"minari: {minari}, {written.total_episodes} episodes and {written.total_steps} steps")
     if unfinished is not None:
         why, status = unfinished
         say(f"khop: {why}; {'above are the episodes that were' if comparison.rows else 'none was'} played until then")
         raise typer.Exit(status)
+
+
+def _command(environment: str, options: Mapping[str, object], env: Sequence[str]) -> str:
+    """That makes the same recording; the number of workers isn't in it, which changes nothing."""
+    words = ["khop", "evaluate", environment]
+    for name, value in options.items():
+        words += [f"--{name}", str(value)] if value is not None else []
+    for argument in env:
+        words += ["--env", argument]
+    return shlex.join(words)
 
 
 def _print(comparison: Comparison, csv: bool, as_json: bool) -> None:

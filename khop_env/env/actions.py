@@ -39,8 +39,9 @@ class ActionReader:
         ]
         if unlimited:
             raise ValueError(
-                f"actions are fractions of the input limits, and {', '.join(unlimited[:4])} has none: give its model "
-                "an input_limit"
+                f"actions are fractions of the input limits, and {', '.join(unlimited[:4])} "
+                + ("has none: give its model" if len(unlimited) == 1 else "have none: give their models")
+                + " an input_limit"
             )
         sizes = np.array([model.m for model in models])
         entries = (np.full(len(sizes), sizes.max()) if uniform else sizes) + message_size

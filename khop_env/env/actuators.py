@@ -89,6 +89,7 @@ class Hold(Actuator):
 
 
 ACTUATORS: dict[str, type[Actuator]] = {"direct": Direct, "lag": Lag, "slew": SlewLimit, "hold": Hold}
+"""Actuators by name, without parameters."""
 
 
 def as_actuator(actuator: str | Actuator) -> Actuator:

@@ -22,6 +22,7 @@ from khop_env.observers import FloatArray, IntArray
 from khop_env.simulation import Simulator
 from khop_env.simulation.received import ReceivedStates, links_up
 from khop_env.tasks import Outcome, Task, World
+from khop_env.tasks.checks import require_columns, require_outcome
 
 
 class BatchedEnv:
@@ -68,6 +69,7 @@ class BatchedEnv:
             initial=simulator.initial,
         )
         self.task = copy.deepcopy(task)
+        self.task.memory = {}  # for those that override `bind` and have none
         self.task.bind(self.world)
         members = [int(i) for i in self.task.acting(self.world)]
         self.agents = tuple(self.fleet.ids[i] for i in members)
@@ -84,6 +86,8 @@ class BatchedEnv:
         )
         self.layouts: tuple[ObservationLayout, ...] = tuple(observed.layouts)
         self.observation_offset, self._read_observations = observed.offset, observed.readout
+        named = {layout.agent: layout.names for layout in self.layouts}
+        require_columns(self.task, self._read_observations.task_rows, named)
         self.state_fields, self._read_state = global_state(self.fleet, settings.limit, settings.inputs_are_states)
         self._actions = ActionReader(self.fleet, members, settings.uniform, self.num_envs, settings.message_size)
         self.action_offset: IntArray = self._actions.offset
@@ -292,7 +296,9 @@ class BatchedEnv:
         self.task.moved(self.world, number)
 
     def _evaluate(self) -> Outcome:
-        return self.task.evaluate(self.world)
+        outcome = self.task.evaluate(self.world)
+        require_outcome(self.task, outcome, self.num_envs, len(self.agents))
+        return outcome
 
     def _observe(self) -> tuple[Float32Array, IntArray]:
         """Observations, and the number of clipped entries of each agent's."""

@@ -120,7 +120,7 @@ class ObservationLayout:
         return np.array(found or [self.index(prefix)], np.int64)
 
     def read(self, observation: ArrayLike) -> dict[str, NDArray[np.float32]]:
-        """Values by name from observations (..., D); each has shape (...).
+        """Values by name from observations (..., D); each has shape (...), a number for a single observation.
 
         Raises:
             ValueError: if the last axis isn't D long.
@@ -128,7 +128,7 @@ class ObservationLayout:
         values = np.asarray(observation)
         if values.shape[-1:] != (len(self),):
             raise ValueError(f"observations of {self.agent!r} have {len(self)} columns; got shape {values.shape}")
-        return {name: values[..., column] for column, name in enumerate(self.names)}
+        return {name: values[..., column][()] for column, name in enumerate(self.names)}  # [()]: not arrays of 0 axes
 
     def build(self, values: Mapping[str, ArrayLike]) -> Float32Array:
         """Observations (..., D) from values by name, which are broadcast against each other.

@@ -44,7 +44,7 @@ class Channel:
     def allocate(self) -> ChannelMemory:
         """Memory before the first reset.
 
-        Returns:
+        Keys:
             key: (B,) of each environment's randomness.
             round: (B,) the last round, -1 before the first.
             bad: (L, B) whether a link is in the state in which it loses messages.

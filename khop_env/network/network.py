@@ -181,3 +181,4 @@ PROFILES: dict[str, Network] = {
     # A crowded Crazyradio channel without acknowledgements; figures of ours.
     "crazyradio": Network(latency=0.026, loss=0.3),
 }
+"""Networks by name; `khop network` lists them."""

@@ -7,6 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 Span: TypeAlias = float | tuple[float, float]
+"""A number, or a range (low, high) from which each episode draws."""
 
 
 def parsed(text: str, what: str) -> Span | None:

@@ -49,8 +49,18 @@ class Schedule:
         return Activity([part.part(links, positions, number) for number, part in enumerate(self.parts)])
 
     def part(self, links: Links, positions: IndexArray, number: int) -> Part:
-        """This schedule alone, bound; `number` tells its random numbers from those of the others."""
-        raise NotImplementedError
+        """This schedule alone, bound to links; a schedule of your own writes this method.
+
+        Args:
+            links: all that may ever be up; `links.sender` and `links.receiver` (L,) are agents' indices.
+            positions: (N, d) rows of the agents' positions in the states.
+            number: tells its random numbers from those of other schedules.
+
+        Returns:
+            A function of (key (B,), t (B,), x (n, B), out (L, B)) that clears in `out` the links that are down, from
+            these arguments alone; one that can be pickled, as `functools.partial` of a module's function can.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no part(links, positions, number)")
 
     @staticmethod
     def of(schedule: Schedule | Mapping[str, object] | Sequence[Mapping[str, object]] | None) -> Schedule | None:

@@ -38,7 +38,8 @@ class Certificate:
     Attributes:
         growth: as the model declares it, None if it doesn't.
         rate: (n,) bound on |g| + |w|, in state units per second.
-        longest_step: longest Euler step in s of a sampled system that is certified (docs, "Sampled systems").
+        longest_step: longest Euler step in s of a sampled system that is certified (docs/theory/certificates.md,
+            "Sampled systems").
         reason: why nothing is certified; "" for a certificate that bounds every component.
 
     Raises:

@@ -9,6 +9,8 @@ component, all its eta_i observers get one funnel, by one of two rules:
 Either way M_i^-1 >= 0 entry by entry, so that |xi| < rho_i bounds the error of each observer a by its own number
 
     |x_tilde_a| < [M_i^-1 1]_a rho_i(t) <= delta_i(t).
+
+The whole way from bounds to funnels: docs/theory/design.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The explicit step, with which the paper samples its example: accurate and simple, and stable at about 1e-5 s only."""
+"""The explicit step, with which the paper samples its example: accurate and simple, and stable at about 1e-5 s only.
+
+Why: docs/theory/step.md, "Why explicit steps are short".
+"""
 
 from __future__ import annotations
 

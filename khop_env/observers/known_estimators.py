@@ -1,4 +1,4 @@
-"""Estimators by name, and checks of estimators of a user's own."""
+"""Estimators by name, and checks of observers and estimators of a user's own."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from khop_env.observers.base import Memory, Observers
 from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.layout import IntArray
 from khop_env.observers.rounds import Rounds
@@ -28,14 +29,46 @@ def as_estimator(estimator: str | Estimator) -> Estimator:
         return ESTIMATORS[estimator]()
     if isinstance(estimator, type):
         raise ValueError(f"an estimator is an object, not a class: write {estimator.__name__}()")
-    needed = ["name", *(name for name, member in vars(Estimator).items() if callable(member) and name[0] != "_")]
-    missing = [name for name in needed if not hasattr(estimator, name)]
+    missing = _missing(estimator, Estimator, ("name",))
     if missing:
         raise ValueError(
             f"an estimator is a name ({', '.join(ESTIMATORS)}) or an Estimator; got {estimator!r}, which has no "
             f"{missing[0]}"
         )
     return copy.copy(estimator)
+
+
+def as_observers(observers: Observers) -> Observers:
+    """A realisation of the observers, as it is.
+
+    Raises:
+        ValueError: for an object that isn't one.
+    """
+    if isinstance(observers, type):
+        raise ValueError(f"observers are an object, not a class: write {observers.__name__}()")
+    missing = _missing(observers, Observers, ("name", "order", "by_messages", "copied"))
+    if missing:
+        raise ValueError(f"observers have what khop_env.observers.Observers says; {observers!r} has no {missing[0]}")
+    return observers
+
+
+def require_own_names(estimator: Estimator, own: Memory, others: Memory) -> None:
+    """Refuse an estimator whose memory has names that are in use.
+
+    Raises:
+        ValueError: naming them.
+    """
+    if twice := [name for name in own if name in others]:
+        raise ValueError(
+            f"estimator {estimator.name!r}: its memory has {', '.join(map(repr, twice))}, which messages use "
+            f"themselves; choose other names, e.g. '{estimator.name}.{twice[0]}'"
+        )
+
+
+def _missing(found: object, protocol: type, attributes: tuple[str, ...]) -> list[str]:
+    """Attributes and methods that a protocol asks for and an object doesn't have."""
+    methods = (name for name, member in vars(protocol).items() if callable(member) and name[0] != "_")
+    return [name for name in (*attributes, *methods) if not hasattr(found, name)]
 
 
 def require_memory(estimator: Estimator, components: IntArray) -> None:

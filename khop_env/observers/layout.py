@@ -19,6 +19,7 @@ from khop_env.observers.ordering import profile_order
 from khop_env.physics import Links
 
 IntArray = NDArray[np.int64]
+"""An array of int64."""
 FloatArray = NDArray[np.float64]
 
 

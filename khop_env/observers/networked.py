@@ -22,7 +22,7 @@ from khop_env.observers.certificate import Certificate
 from khop_env.observers.certified import report
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.estimators import Estimator
-from khop_env.observers.known_estimators import as_estimator, require_memory
+from khop_env.observers.known_estimators import as_estimator, require_memory, require_own_names
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, largest_share, merge
 from khop_env.observers.reckoning import Reckoning
@@ -102,7 +102,7 @@ class Networked:
         """Predictions from what was received, its stamps and ways, the estimates, their bounds; channel; estimator."""
         (size, pairs), batch = (self.layout.size, self.layout.pairs), self.num_envs
         channel = {_CHANNEL + name: values for name, values in self.channel.allocate().items()}
-        return {
+        memory = {
             "estimate": np.zeros((size, batch)),
             "input_estimate": np.zeros((self.design.inputs.layout.size, batch)),
             "bound": np.zeros((size, batch)),
@@ -115,9 +115,11 @@ class Networked:
             "data": np.zeros((pairs * self.message_size, batch)),
             "step": np.zeros(batch),
             "even_since": np.zeros(batch),
-            **self.estimator.allocate(),
             **channel,
         }
+        own = self.estimator.allocate()
+        require_own_names(self.estimator, own, memory)
+        return memory | own
 
     def reset(
         self, state: PlantState, env_ids: IntArray, rngs: Sequence[np.random.Generator], first_guess: FloatArray

@@ -1,4 +1,7 @@
-"""The paper's observers by a coupled proximal step: implicit-explicit Runge-Kutta, inside the funnels for any step."""
+"""The paper's observers by a coupled proximal step: implicit-explicit Runge-Kutta, inside the funnels for any step.
+
+docs/theory/step.md has the proof, and what is measured only.
+"""
 
 from __future__ import annotations
 

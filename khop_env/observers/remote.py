@@ -1,7 +1,7 @@
 """What a robot knows of another one: its freshest state, a prediction from it, and the certified box around that.
 
 On top of `Certificate` it takes account of clocks that differ and of numbers that were rounded on their way
-(docs/theory/certificates.md, section Clocks).
+(docs/theory/certificates.md, "Clocks").
 """
 
 from __future__ import annotations

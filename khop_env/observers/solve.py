@@ -6,7 +6,8 @@ For one target and component the step solves, for the observers' estimates y,
 
 with everything at the end of the step: the optimality condition of a strictly convex problem that is finite only
 inside the open funnel, so there is exactly one solution for every tau > 0, every predictor y* and every jump of x_i,
-and it satisfies |e| < 1 (proximal point of a self-concordant barrier; Y. Nesterov and A. Nemirovskii, 1994).
+and it satisfies |e| < 1 (docs/theory/step.md; proximal point of a self-concordant barrier; Y. Nesterov and A.
+Nemirovskii, 1994).
 
 Written in the impulse z = phi'(e) and with b = P^-1 (M y* - h x_i), s = tau / rho^2, it reads
 

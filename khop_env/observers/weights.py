@@ -3,7 +3,7 @@
 A link weighs 1 while it is up, else 0. A neighbour p relays target i's state to observer a while i -> p and p -> a are
 both up. Observers use the estimates of those observers only that the target reaches along links that are up: the others
 know nothing of it that isn't old. So an observer that is cut off has a row of zeros, and predicts; the matrix of the
-others is that of the paper on the graph of this instant, and never singular.
+others is a nonsingular M-matrix (docs/theory/graphs.md, "Changing graphs").
 """
 
 from __future__ import annotations

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from khop_env.physics.growth import Growth
 
 FloatArray: TypeAlias = NDArray[np.float64]
+"""An array of float64."""
 Array = TypeVar("Array", bound=np.ndarray)
 IndexArray: TypeAlias = NDArray[np.intp]
+"""An array of indices."""
 InputLimit: TypeAlias = Any  # set to a number or one per input; read as a float array of shape (m,)
 
 
@@ -68,6 +70,15 @@ def _same(first: FloatArray, second: FloatArray) -> bool:
     """True if rates (K, n) agree, to rounding of the largest of each component."""
     scale = np.maximum(np.abs(first), np.abs(second)).max(axis=0)
     return not bool(np.any(np.abs(first - second) > 1e-9 * scale))
+
+
+def _hashable(value: object) -> object:
+    """A parameter as something that can be compared and hashed."""
+    if isinstance(value, np.ndarray):
+        return value.tobytes()
+    if isinstance(value, Mapping):
+        return tuple((key, _hashable(entry)) for key, entry in value.items())
+    return tuple(map(_hashable, value)) if isinstance(value, list) else value
 
 
 class AgentModel:
@@ -290,9 +301,7 @@ class AgentModel:
         object.__setattr__(self, "input_limit", limit)  # the library's models are frozen
 
     def _key(self) -> tuple[object, ...]:
-        return self.__class__, *(
-            (name, value.tobytes() if isinstance(value, np.ndarray) else value) for name, value in vars(self).items()
-        )
+        return self.__class__, *((name, _hashable(value)) for name, value in vars(self).items())
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, AgentModel) and self._key() == other._key())

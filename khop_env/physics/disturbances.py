@@ -151,6 +151,7 @@ DISTURBANCES: dict[str, type[Term]] = {
     "gust": Gust,
     "coupling": Coupling,
 }
+"""Disturbances by name, as scenario files have it."""
 
 
 def _check_range(term: Term, name: str) -> None:

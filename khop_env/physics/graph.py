@@ -53,7 +53,8 @@ def validate_graph(
         wrong = [f"missing {_listed(missing)}"] * bool(missing) + [f"unexpected {_listed(unexpected)}"] * bool(
             unexpected
         )
-        raise ValueError(f"{name}: the nodes must be exactly the integers 0 to {agents - 1}; {', '.join(wrong)}")
+        hint = "" if unexpected else f"; graph.add_nodes_from(range({agents})) adds agents without edges"
+        raise ValueError(f"{name}: the nodes must be exactly the integers 0 to {agents - 1}; {', '.join(wrong)}{hint}")
     loops = list(nx.selfloop_edges(graph))
     if loops:
         raise ValueError(f"{name}: an agent can't be its own neighbour; remove the self-loops {_listed(loops)}")

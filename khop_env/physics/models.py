@@ -312,3 +312,4 @@ class SurfaceVessel(AgentModel):
 MODELS: dict[str, type[AgentModel]] = {
     model.type: model for model in (SingleIntegrator, DriftingIntegrator, DoubleIntegrator, Unicycle, SurfaceVessel)
 }
+"""Agent models by `type`, as scenario files name them."""

@@ -52,6 +52,10 @@ VELOCITY_CONTROLLERS: dict[str, VelocityController] = {
     "unicycle": _unicycle,
     "vessel": _vessel,
 }
+"""For each type of agents a function (model, x, velocity) -> inputs that makes their position follow a velocity.
+
+Laws and scripted policies command velocities; a model of your own needs an entry under its `type`.
+"""
 
 
 def velocity_to_input(model: AgentModel, x: FloatArray, velocity: FloatArray) -> FloatArray:

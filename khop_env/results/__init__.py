@@ -2,8 +2,11 @@
 
 from khop_env.results.assumptions import Assumption, assumptions
 from khop_env.results.curves import error_over_time, learning_curves, network_figure, set_iss_figure
+from khop_env.results.dataset import EpisodeDataset
+from khop_env.results.episodes import EpisodeRecorder
 from khop_env.results.figures import paper_figure
 from khop_env.results.metrics import consensus_error, summarize
+from khop_env.results.minari_dataset import write_minari
 from khop_env.results.network_report import network_report
 from khop_env.results.networks import NetworkRow, measure_networks
 from khop_env.results.recording import Recording, record
@@ -14,6 +17,8 @@ from khop_env.results.writing import RunFileError, write_run
 
 __all__ = [
     "Assumption",
+    "EpisodeDataset",
+    "EpisodeRecorder",
     "MessageRecord",
     "NetworkRow",
     "ObserverRecord",
@@ -33,5 +38,6 @@ __all__ = [
     "set_iss_figure",
     "states_table",
     "summarize",
+    "write_minari",
     "write_run",
 ]

@@ -16,7 +16,7 @@ from khop_env.scenarios import Scenario
 def network_report(scenario: Scenario, network: Network) -> dict[str, Any]:
     """The guarantees of a scenario's estimates over a network, as plain JSON.
 
-    Returns:
+    Keys:
         network: in words.
         types: per type of agents whether all its states are certified, and the reason if not.
         bounds: per type and distance in links from its agents: expected_age of the state that is known, in s, where

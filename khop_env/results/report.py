@@ -18,7 +18,7 @@ from khop_env.simulation.plant import parts_of_step
 def design_report(scenario: Scenario) -> dict[str, Any]:
     """Design report of a scenario: feasibility, targets, bounds and the paper's assumptions.
 
-    Returns:
+    Keys:
         feasible: True if all conditions of the observers that can be checked before the start hold; otherwise `error`
             names the violated condition.
         edges: number of edges of the communication graph, or of links if it is directed; one_way_links: number of links

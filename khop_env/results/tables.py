@@ -36,8 +36,7 @@ def estimates_table(recording: Recording) -> pl.DataFrame:
 
     Over a network of messages there are estimates of states only, of neighbours as well; disagreement, rho and delta
     are null, since they guarantee nothing there, bound is the certified one (inf where nothing is certified), and there
-    is one column more:
-        age: time since the newest state that has arrived was measured, in s; inf where none has.
+    is one column more, age: time since the newest state that has arrived was measured, in s; inf where none has.
     """
     import polars as pl
 

@@ -27,8 +27,10 @@ from khop_env.observers import (
     as_estimator,
 )
 from khop_env.observers.design import design_rule_for
+from khop_env.observers.known_estimators import as_observers
 from khop_env.physics import AgentModel, Disturbance, Fleet, Links, check_task_graph, did_you_mean, validate_graph
 from khop_env.scenarios.bounds import check_bound, widened
+from khop_env.scenarios.parts import require_parts
 from khop_env.simulation import Arena, InitialSet, Law, Observe, Simulator
 
 MOST_AGENTS = 100_000
@@ -146,14 +148,7 @@ class Scenario:
             raise ValueError(
                 f"a scenario's name is also a folder's: 1 to 200 characters without '/'; got {self.name[:200]!r}"
             )
-        for what, values in (
-            ("relay", [self.relay]),
-            ("the drift of its observers", [option.drift for option in self.observers or ()]),
-            ("the input_observer of its observers", [option.input_observer for option in self.observers or ()]),
-        ):
-            for value in values:
-                if not isinstance(value, bool | np.bool):
-                    raise ValueError(f"scenario {self.name!r}: {what} must be True or False; got {value!r}")
+        require_parts(self.name, vars(self))
         if self.order not in (1, 2):
             raise ValueError(f"scenario {self.name!r}: order must be 1 or 2; got {self.order!r}")
         if not 0 < len(self.models) <= MOST_AGENTS:
@@ -297,9 +292,9 @@ class Scenario:
             num_envs: number of environments B.
 
         Raises:
-            ValueError: for more environments than `MOST_NUMBERS` states and estimates allow.
+            ValueError: for more environments than `MOST_NUMBERS` states and estimates allow, or observers that aren't.
         """
-        realisation = observers or self._realisation()
+        realisation = self._realisation() if observers is None else as_observers(observers)
         estimated = self.design.knowledge if realisation.by_messages else self.design.states.layout
         width = self.fleet.n + estimated.size + self.design.inputs.layout.size
         if num_envs * width > MOST_NUMBERS:

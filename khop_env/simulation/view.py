@@ -15,7 +15,9 @@ from khop_env.physics import Fleet, read_only
 from khop_env.simulation.received import ReceivedStates, links_up
 
 Observe = Literal["estimate", "oracle", "local"]
+"""Source of the states of agents beyond the neighbours: their estimates, the true states, or none."""
 OBSERVE: tuple[Observe, ...] = ("estimate", "oracle", "local")
+"""All observation modes."""
 
 
 @dataclass(slots=True)

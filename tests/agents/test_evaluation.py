@@ -209,6 +209,10 @@ def test_mistakes():
         evaluate(batched("consensus_v0", num_envs=1), {"stubborn": Stubborn}, [0])
     with pytest.raises(TypeError, match=r"policy 'tanh' is of type str: a policy has reset\(env, seeds\)"):
         evaluate(batched("consensus_v0", num_envs=1), {"tanh": "tanh"}, [0])
+    with pytest.raises(ValueError, match=r"policies must be names.* got <agents.* For objects: evaluate\(env"):
+        compare("consensus_v0", [make_policy("zero")])
+    with pytest.raises(ValueError, match=r"seeds must be one per episode, e\.g\. range\(100\); got 3"):
+        compare("consensus_v0", ["zero"], seeds=3)
     with pytest.raises(ValueError, match="no seeds given"):
         compare("consensus_v0", ["tanh"], seeds=[])
     with pytest.raises(ValueError, match="no environment 'consensus'; did you mean 'consensus_v0'"):

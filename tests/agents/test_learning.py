@@ -12,14 +12,10 @@ import numpy as np
 import pytest
 
 from agents import make_policy, play
-from agents.learning import (
-    LearnedPolicy,
-    TrainingConfig,
-)
+from agents.learning import LearnedPolicy, TrainingConfig, train
 from agents.learning.environment import training_environment
 from agents.learning.networks import make_model
 from agents.learning.run_folder import CHECKPOINT
-from agents.learning.training import train
 from tests.agents.training import SMALL
 from tests.env.playing import batched
 

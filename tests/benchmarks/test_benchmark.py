@@ -73,6 +73,32 @@ def test_every_promised_figure_is_printed():
     assert all(np.isfinite(value) and value > 0 for value in rows.values())
     assert rows["proximal_error"] < 2e-3
     assert lines
+    assert all(row["explanation"] for row in report["rows"])
+
+
+def test_rows_say_whether_they_keep_their_target():
+    report = Report()
+    for name, value, bounds in (
+        ("training", 3.0, {"least": 3.0}),
+        ("training", 2.9, {"least": 3.0}),
+        ("violations", 1.0, {"most": 0.0}),
+        ("violations", 0.0, {"most": 0.0}),
+        ("training", 1.0, {}),
+    ):
+        report.add(name, value, **bounds)
+    assert [(row["target"], row["met"]) for row in report.rows] == [
+        ("at least 3", True),
+        ("at least 3", False),
+        ("at most 0", False),
+        ("at most 0", True),
+        ("", None),
+    ]
+
+
+def test_parts_by_name(quick_parts):
+    assert [row["name"] for row in benchmark(quick=True, only=["growth", "explicit"])["rows"]] == ["row 0", "row 1"]
+    with pytest.raises(ValueError, match="unknown part 'speed' of the benchmark; the parts are explicit, scipy, solve"):
+        benchmark(only=["growth", "speed"])
 
 
 def test_ratios_to_peers(tmp_path, monkeypatch):
@@ -101,7 +127,7 @@ def test_ratios_to_peers(tmp_path, monkeypatch):
         assert rows[name][0] == rows[name.removesuffix("_ratio")][0] / 100.0
     assert rows["vector_convoy_jax_ratio"][1:] == (
         "x JaxMARL simple_spread, batch 64, a step a call: our one thread against XLA's own pool",
-        "aim 1",
+        "at least 1",
     )
     assert asked[0] == (tmp_path / "mpe2" / "bin" / "python", "mpe2", 1, 1)
 
@@ -207,6 +233,7 @@ def test_what_was_measured_is_not_lost(quick_parts, monkeypatch, error):
 def test_ctrl_c_ends_the_command_with_a_table():
     command = [sys.executable, "-m", "khop_env", "bench", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert "this takes about" in process.stderr.readline()
     assert process.stderr.readline().startswith("proximal against explicit")
     process.send_signal(signal.SIGINT)
     output, said = process.communicate(timeout=60)

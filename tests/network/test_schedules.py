@@ -58,7 +58,7 @@ class TestKinds:
 
     def test_a_change_does_not_wait_for_rounding(self):
         """Ten steps of 0.1 s end at 0.9999999999999999 s."""
-        t = sum([0.1] * 10)
+        t = np.cumsum([0.1] * 10)[-1]
         assert t < 1.0
         assert len(edges_up(Switching((RING, nx.Graph([(1, 2)])), times=(0, 1)), t=t)) == 2
         assert len(edges_up(Outage(1.0, 1.0, agent=0), t=t)) == 8
@@ -254,3 +254,10 @@ class TestAsUsersWriteThem:
     def test_only_schedules_are_joined(self):
         with pytest.raises(TypeError):
             _ = Fixed() & 3
+
+    def test_a_schedule_of_ones_own_needs_a_part(self):
+        class Own(Schedule):
+            pass
+
+        with pytest.raises(NotImplementedError, match=r"Own has no part\(links, positions, number\)"):
+            Own().bind(Links.of(nx.path_graph(3)), np.zeros((3, 2), np.int64))

@@ -56,7 +56,7 @@ def test_curvature_is_the_second_derivative(e):
     )
 
 
-def testbarrier_is_self_concordant_up_to_a_constant():
+def test_barrier_is_self_concordant_up_to_a_constant():
     """|phi'''| <= 1.31 phi''^(3/2) on the whole interval: phi is self-concordant (Nesterov and Nemirovskii, 1994)."""
     e = np.concatenate([np.linspace(-0.999, 0.999, 20_001), 1 - np.geomspace(1e-15, 1e-3, 1000)])
     t, j = 2 * np.arctanh(e), 2 / ((1 - e) * (1 + e))
@@ -68,7 +68,7 @@ def testbarrier_is_self_concordant_up_to_a_constant():
 
 
 @given(eps=TRANSFORMED)
-def testbarrier_in_the_transformed_unknown(eps):
+def test_barrier_in_the_transformed_unknown(eps):
     """e = tanh(eps / 2) inverts T, z = phi'(e) = T J_T = eps (1 + cosh eps), and d eps / dz is its reciprocal slope."""
     e, z, gain = barrier(eps)
     exact = mpmath.mpf(eps)

@@ -13,6 +13,7 @@ from khop_env.network import Network
 from khop_env.observers import (
     ESTIMATORS,
     Exponential,
+    FunnelObservers,
     Networked,
     ObserverDesign,
     Proximal,
@@ -356,6 +357,10 @@ def test_a_proposal_that_is_not_a_number_gives_the_prediction():
         ({"proposed": "kept.state"}, "proposed = 'kept.state' isn't in its memory, held.state"),
         ({"width": 2}, r"message\(\) has 0 rows, its width is 2"),
         ({"width": None}, r"width must be the number of rows of message\(\), 0 for none; got None"),
+        (
+            {"allocate": lambda: {"held.state": np.zeros((12, 1)), "stamp": np.zeros(6)}},
+            "its memory has 'stamp', which messages use themselves; choose other names, e.g. 'held.stamp'",
+        ),
         ({"allocate": lambda: None}, r"allocate\(\) must return a dictionary of arrays, empty for none; got None"),
     ],
 )
@@ -380,6 +385,10 @@ def test_mistakes_are_named():
         Networked("wifi", type("Mine", (), {"name": "mine"})())
     with pytest.raises(ValueError, match=r"an estimator is an object, not a class: write Relay\(\)"):
         Networked("wifi", Relay)
+    with pytest.raises(ValueError, match=r"observers are an object, not a class: write Proximal\(\)"):
+        paper().build(observers=Proximal)
+    with pytest.raises(ValueError, match=r"khop_env\.observers\.Observers says; .* has no name"):
+        paper().build(observers=FunnelObservers())
 
 
 def test_a_step_that_is_interrupted_half_way_cannot_be_gone_on_from():

@@ -155,6 +155,27 @@ def test_solution_does_not_depend_on_the_warm_start(graph, about, seed, spread):
     assert np.all(np.abs(warm[0] - cold[0]) <= slack @ (2e-14 * size + 1e-8 * rho[layout.column_row]))
 
 
+@settings(max_examples=15)
+@given(graph=connected_graphs(largest=7) | digraphs(largest=7), about=hops(), seed=SEEDS)
+def test_a_loose_tolerance_is_inaccurate_but_keeps_the_funnel(graph, about, seed):
+    """Newton's last step is linear in z, so the estimates end inside after any step below 1 in eps: run in Python,
+    where the tolerance can be changed.
+    """
+    layout = layout_of(graph, *about)
+    tau, predictor, source, rho = problem(layout, np.random.default_rng(seed), 2, hard=False)
+    eps, slope, estimate = np.zeros_like(predictor), np.empty_like(predictor), np.empty_like(predictor)
+    in_python = getattr(solve, "py_func", solve)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(in_python.__globals__, "TOLERANCE", 0.99)
+        result = in_python(
+            layout.packed, tau, predictor, source, rho, eps, estimate, slope, (0, 2), (0, len(layout.blocks))
+        )
+    assert result[1] == -1
+    m, h = full_matrix(layout)
+    xi = m @ estimate - h[:, None] * source[layout.column_source]
+    assert np.all(np.abs(xi) < rho[layout.column_row])
+
+
 @settings(max_examples=40)
 @given(
     graph=connected_graphs(largest=7) | digraphs(largest=7),

@@ -159,6 +159,19 @@ def test_vessels_coriolis_forces_do_no_work_and_drag_brakes(seed: int) -> None:
     assert (vessel_power(SurfaceVessel(), x) < 0).all()
 
 
+def test_parameters_in_lists_and_dictionaries_compare_and_hash() -> None:
+    """States declared on the instance are a dictionary, and certificates look models up."""
+
+    class Tuned(Pendulum):
+        def __init__(self, gains: list[float]) -> None:
+            self.gains, self.states = gains, {"angle": "rad", "rate": "rad/s"}
+            super().__init__()
+
+    assert Tuned([1.0, 2.0]) == Tuned([1.0, 2.0])
+    assert Tuned([1.0, 2.0]) != Tuned([1.0, 3.0])
+    assert hash(Tuned([1.0, 2.0])) == hash(Tuned([1.0, 2.0]))
+
+
 def test_equal_parameters_compare_equal_and_hash_alike() -> None:
     assert Unicycle() == Unicycle(input_limit=[1.0, 2.0])
     assert hash(Unicycle()) == hash(Unicycle(input_limit=(1.0, 2.0)))

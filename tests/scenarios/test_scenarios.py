@@ -6,7 +6,7 @@ import pytest
 
 from agents import make_law
 from khop_env.observers import Exponential, TargetObservers
-from khop_env.physics import DriftingIntegrator, Sum, random_geometric_graph
+from khop_env.physics import DriftingIntegrator, Sinusoid, Sum, random_geometric_graph
 from khop_env.results import design_report
 from khop_env.scenarios import convoy, mixed_fleet, paper, random_geometric
 from khop_env.scenarios.files import write_scenario
@@ -180,6 +180,11 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
         ({"duration": 10**400}, "duration must be from"),
         ({"duration": 1e6, "dt": 1e-6}, r"1e\+12 steps, and 1e\+08 are the most; take dt of 0.01 s or more"),
         ({"relay": "false"}, "relay must be True or False; got 'false'"),
+        ({"models": DriftingIntegrator()}, r"models must be one AgentModel per agent, .* got DriftingIntegrator"),
+        ({"observers": TargetObservers()}, "observers must be None, or one TargetObservers per agent; got Target"),
+        ({"disturbance": Sinusoid}, r"a Disturbance, an object and not its class, e\.g\. Sinusoid\(0\.3\); got <class"),
+        ({"arena": 0.2}, r"arena must be None or an Arena, .* got 0\.2"),
+        ({"law": "tanh"}, r"law must be a LawChoice, .* got 'tanh'"),
         (
             {"observers": (TargetObservers(drift="no"),) * 8},
             "the drift of its observers must be True or False; got 'no'",

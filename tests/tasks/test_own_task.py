@@ -64,6 +64,66 @@ def test_its_memory_is_saved_and_restored():
         np.testing.assert_array_equal(ours, theirs)
 
 
+def changed(**parts):
+    """A task that returns another outcome, by part."""
+
+    class Wrong(KeepApart):
+        def evaluate(self, world):
+            outcome = super().evaluate(world)
+            return outcome._replace(**{name: change(getattr(outcome, name)) for name, change in parts.items()})
+
+    return Wrong
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"reward": np.transpose}, r"reward must be an array of shape \(1, 8\), .*; got shape \(8, 1\) of float64"),
+        ({"reward": lambda _: 0.0}, r"reward must be an array of shape \(1, 8\), .*; got 0\.0"),
+        ({"terminated": lambda _: False}, r"terminated must be an array of 1 bools, .*; got False"),
+        ({"terminated": lambda old: 1.0 * old}, r"terminated must .*; got shape \(1,\) of float64"),
+        ({"infos": lambda old: {"too_close": old["too_close"]}}, "infos must have 'task_error', .* got 'too_close'"),
+        ({"infos": lambda old: old | {"more": np.zeros(8)}}, r"the info more must be .* got shape \(8,\)"),
+        ({"infos": lambda old: list(old)}, r"must return Outcome\(reward, terminated, infos\), infos by name; got"),
+    ],
+)
+def test_a_wrong_outcome_is_named(parts, message):
+    env = khop_env.make(changed(**parts), "paper")
+    with pytest.raises(ValueError, match=rf"Wrong\.evaluate\(\).*{message}"):
+        env.reset(seed=0)
+
+
+def test_columns_need_a_writer_and_names_of_their_own():
+    class Silent(KeepApart):
+        observe = khop_env.Task.observe
+
+    class Twice(KeepApart):
+        def columns(self, world, agent):
+            return [*super().columns(world, agent), khop_env.Column("own.x1", "m", -1.0, 1.0)]
+
+    with pytest.raises(ValueError, match=r"'silent' has columns with a row, and no observe\(world, out\)"):
+        khop_env.make(Silent, "paper")
+    with pytest.raises(ValueError, match=r"'twice': the observation of 'drifter_0' has two columns 'own\.x1'"):
+        khop_env.make(Twice, "paper")
+
+
+def test_a_task_without_memory_needs_none():
+    class Plain(KeepApart):
+        def bind(self, world):
+            """Nothing to prepare, and no call of the method above."""
+
+        reset = khop_env.Task.reset
+        columns = khop_env.Task.columns
+
+        def evaluate(self, world):
+            distance = np.linalg.norm(world.positions(), axis=1).T
+            return khop_env.Outcome(-distance, np.zeros(world.num_envs, bool), {"task_error": distance})
+
+    env = khop_env.make(Plain, "paper")
+    env.reset(seed=0)
+    assert env.get_state().task == {}
+
+
 def test_every_kind_of_environment():
     """Parallel, AEC, vector, SB3, joint; a frame that shows the goals."""
     aec = make_aec(KeepApart, "paper")
