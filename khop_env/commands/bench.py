@@ -25,8 +25,8 @@ def bench(
     only: Annotated[
         str | None,
         typer.Option(
-            help="Parts: explicit,scipy,solve,growth,environments,network,violations,filter,collisions,training; by "
-            "default all."
+            help="Parts, e.g. explicit,solve; by default all: explicit, scipy, solve, growth, environments, network, "
+            "violations, filter, collisions, training."
         ),
     ] = None,
     as_json: JsonOption = False,
