@@ -49,15 +49,15 @@ integrations: $(INTEGRATIONS:%=integration-%)
 
 packages_agilerl = -e . agilerl==2.58.0 peft==0.21.2 transformers==5.24.0 gymnasium==1.4.0 pettingzoo==1.26.1
 runs_agilerl = integrations/run_agilerl.py
-needs_agilerl = 2.6 GB, 4 minutes
+needs_agilerl = 2.7 GB, 5 minutes
 
 packages_benchmarl = -e . benchmarl==1.5.2 torchrl==0.11.1 gymnasium==1.4.0 pettingzoo==1.27.0
 runs_benchmarl = integrations/run_benchmarl.py
-needs_benchmarl = 1.6 GB, 4 minutes
+needs_benchmarl = 1.6 GB, 5 minutes
 
 packages_cleanrl = -e . torch
 runs_cleanrl = learning/train_cleanrl_style.py
-needs_cleanrl = 1.4 GB, 3 minutes
+needs_cleanrl = 1.5 GB, 3 minutes
 
 packages_pufferlib = -e . pufferlib-core==3.0.3 gymnasium==1.4.0 pettingzoo==1.27.0
 runs_pufferlib = integrations/run_pufferlib.py
@@ -66,7 +66,7 @@ needs_pufferlib = 0.6 GB, 1 minute
 packages_rllib = -e '.[ray]' 'ray[rllib]==2.60.0' gymnasium==1.2.2 pettingzoo==1.27.0 torch
 runs_rllib = integrations/run_rllib.py integrations/run_evaluation_on_ray.py \
 	learning/train_rllib.py,--iterations,2 learning/train_rllib.py,--iterations,2,--per-type
-needs_rllib = 2.2 GB, 6 minutes
+needs_rllib = 2.2 GB, 8 minutes
 
 packages_tianshou = -e . tianshou==2.0.1 gymnasium==1.4.0 pettingzoo==1.27.0
 runs_tianshou = integrations/run_tianshou.py

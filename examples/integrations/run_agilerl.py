@@ -3,7 +3,6 @@
 make integration-agilerl
 """
 
-
 from importlib.metadata import version
 
 import torch

@@ -28,7 +28,6 @@ NAMES = variable("INTEGRATIONS")
 
 
 def test_every_target_has_a_row():
-    assert NAMES == sorted(NAMES)
     assert set(ROWS) == set(NAMES)
 
 
@@ -47,6 +46,11 @@ def test_a_row_names_scripts_and_versions(name):
 
 
 def test_targets_named_elsewhere_exist():
-    for page in [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", *map(ROOT.joinpath, SCRIPTS)]:
+    for page in [
+        *(ROOT / "docs").rglob("*.md"),
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *map(ROOT.joinpath, SCRIPTS),
+    ]:
         for name in re.findall(r"make integration-(\w+)", page.read_text(encoding="utf-8")):
             assert name in NAMES, f"{page} names `make integration-{name}`"
