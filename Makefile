@@ -8,10 +8,10 @@ demo: .venv/core
 	$(BIN)/khop run paper
 
 test: .venv/test
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 quick: .venv/test
-	$(BIN)/python -m pytest -n auto -m quick
+	$(BIN)/python -m pytest -n auto --dist worksteal -m quick
 
 lint: .venv/dev
 	$(BIN)/ruff check .
