@@ -112,7 +112,7 @@ def back_links(app: Any, page: str, template: str, context: dict[str, Any], doct
     objects = app.env.get_domain("py").objects
 
     def corrected(found: re.Match[str]) -> str:
-        places = (f"{package}.{found[2]}" for package in (*PACKAGES, module))
+        places = (f"{package}.{found[2]}" for package in (*PACKAGES, module, "khop_env.registry"))
         return found[1] + next((place for place in places if place in objects), found[3])
 
     if page.startswith("_modules/"):
