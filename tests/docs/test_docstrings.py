@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 sys.path.append(str(Path(__file__).parents[2] / "docs"))
 
-import docstrings  # noqa: E402  (docs/docstrings.py)
+import docstrings  # of docs
 
 
 def test_source_leads_back_to_the_entry_of_its_name():
