@@ -66,3 +66,4 @@ def setup(app):
     app.connect("autodoc-process-signature", docstrings.signature)
     app.connect("autodoc-skip-member", docstrings.skip)
     app.connect("doctree-resolved", docstrings.other_types)
+    app.connect("html-page-context", docstrings.back_links)

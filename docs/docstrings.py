@@ -40,6 +40,8 @@ _HINTS = (
     ("<factory>", "..."),
 )
 _CLASS = re.compile(r"(?:khop_env|agents)(?:\.\w+)*\.(\w+)")
+_BACK = re.compile(r'(id="([\w.]+)">\n<a class="viewcode-back" href="[^"#]*#)([\w.]+)')
+_NO_PAGE = '<li><a href="builtins.html">builtins</a></li>\n'
 _known: dict[str, str] = {}
 
 
@@ -99,6 +101,22 @@ def other_types(app: Any, doctree: Any, page: str) -> None:
             text = node.astext()
             if (kind is addnodes.desc_annotation or text.startswith("alias of ")) and _short(text) != text:
                 node[:] = [nodes.Text(_short(text))]
+
+
+def back_links(app: Any, page: str, template: str, context: dict[str, Any], doctree: Any) -> None:
+    """Handler of the event for pages to be written: links from source code back to what is documented of it.
+
+    viewcode takes all names of a module for those of one package, and lists modules without a page.
+    """
+    module = page.removeprefix("_modules/").replace("/", ".")
+    objects = app.env.get_domain("py").objects
+
+    def corrected(found: re.Match[str]) -> str:
+        places = (f"{package}.{found[2]}" for package in (*PACKAGES, module, "khop_env.registry"))
+        return found[1] + next((place for place in places if place in objects), found[3])
+
+    if page.startswith("_modules/"):
+        context["body"] = _BACK.sub(corrected, context["body"]).replace(_NO_PAGE, "")
 
 
 def _below(name: str, obj: Any) -> list[str]:

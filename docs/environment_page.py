@@ -26,7 +26,7 @@ def environment_page(name: str) -> str:
             text = re.sub(r"(?m)^\| (?!Columns )(\S.*?) +\|", r"| `\1` |", text)
             text = re.sub(r"(?<![`\w.])\w+\.<\w+>[\w.]*", r"`\g<0>`", text)  # else <state> would be a tag of HTML
             text += observations(module)
-        page += f"\n## {heading}\n{text}"
+        page += f"\n## {heading.capitalize()}\n{text}"
         if heading == "Reward":
             page += policies(name, module)
     return page.rstrip() + "\n"

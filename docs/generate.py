@@ -30,7 +30,7 @@ def command_line(docs: Path) -> None:
 def changelog(docs: Path) -> None:
     """The changelog of the repository, with links to pages."""
     text = (docs.parent / "CHANGELOG.md").read_text(encoding="utf-8")
-    _write(docs / "changelog.md", re.sub(r"(?<![\w(/])docs/([\w/]+\.md)", r"[](\1)", text))
+    _write(docs / "changelog.md", re.sub(r"(?<![\w/])(?<!\]\()docs/([\w/]+\.md)", r"[](\1)", text))
 
 
 def _write(page: Path, text: str) -> None:

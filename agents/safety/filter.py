@@ -173,7 +173,7 @@ class SafetyFilter:
         return self.correct(observations, self.policy.act(self.seen(observations)))
 
     def seen(self, observations: Observations) -> Observations:
-        """What the policy inside, or a learner, gets of observations: those that `inside` describes."""
+        """The observations for the policy inside, or a learner: those that `inside` describes."""
         self._require_reset()
         if not self._kept:
             return observations

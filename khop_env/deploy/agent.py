@@ -152,7 +152,7 @@ class Agent:
         self.writer.knowledge(self.robot.step, timing, self.robot.u, self.receiver.newest, self.estimates)
 
     def counts(self) -> dict[str, Any]:
-        """What became of messages so far."""
+        """Numbers of messages so far, by what became of them."""
         receiver = self.receiver
         return {
             "sent": self.sent,

@@ -57,7 +57,7 @@ class Receiver:
                 self._held[message.sender][number] = message
 
     def complete(self, now: int) -> bool:
-        """Whether everybody's message of round `now` has come, lost or not."""
+        """Return True if everybody's message of round `now` has come, lost or not."""
         return all(number >= now for number in self._come.values())
 
     def missing(self, now: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""What an agent's process has to be told, and what it makes of that."""
+"""The setup of an agent's process, and the objects that are made from it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from khop_env.scenarios import LawChoice, Scenario
 
 @dataclass(frozen=True)
 class Setup:
-    """All that an agent's process has to be told, as JSON has it.
+    """All that an agent's process has to know, as JSON has it.
 
     Attributes:
         scenario: name of the scenario, as commands take it.

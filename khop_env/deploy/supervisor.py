@@ -194,7 +194,7 @@ class Supervisor:
         return time.monotonic() - self._begin
 
     def counts(self) -> list[dict[str, Any]]:
-        """What became of each agent's messages, of all its processes until they said so last."""
+        """Each agent's numbers of messages by what became of them, of all its processes until their last report."""
         found = []
         for agent in range(len(self._setups)):
             said = [each.counts for each in [*self._gone, *self.processes] if each.setup.agent == agent and each.counts]

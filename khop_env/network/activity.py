@@ -28,7 +28,7 @@ class Part(Protocol):
 
 
 class Activity:
-    """Which links are up, of many environments at once.
+    """The links that are up, of many environments at once.
 
     Args:
         parts: a link is up where all of them leave it up.
@@ -38,7 +38,7 @@ class Activity:
         self._parts = tuple(parts)
 
     def up(self, key: KeyArray, t: FloatArray, x: FloatArray, out: BoolArray) -> BoolArray:
-        """Which links are up: a function of these arguments alone.
+        """The links that are up: a function of these arguments alone.
 
         Args:
             key: (B,) of each environment's randomness.

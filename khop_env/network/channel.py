@@ -77,7 +77,7 @@ class Channel:
         return t >= (memory["round"] + (1.0 - 1e-9)) * self.network.period
 
     def measured(self, memory: ChannelMemory, x: FloatArray) -> FloatArray:
-        """What agents measure of states `x` (n, B) and send in the next round of `memory`; `x` itself without noise."""
+        """States `x` (n, B) as agents measure and send them in the next round of `memory`; `x` itself without noise."""
         if self.network.noise == 0.0:
             return x
         out = np.empty(x.shape)

@@ -224,7 +224,7 @@ class RandomLinks(Schedule):
 
 @dataclass(frozen=True)
 class Range(Schedule):
-    """Who is near hears: a link is up while its agents are at most `radius` metres apart.
+    """Links within a range: a link is up while its agents are at most `radius` metres apart.
 
     Attributes:
         radius: in m, positive.

@@ -97,7 +97,7 @@ class Certified(NamedTuple):
 
 
 class Assumptions(NamedTuple):
-    """What a guarantee may assume of the plant.
+    """Assumptions about the plant on which a guarantee may rest.
 
     Attributes:
         center: (n,) centre of the initial set.
@@ -111,7 +111,7 @@ class Assumptions(NamedTuple):
 
 
 class Information(NamedTuple):
-    """What observers that exchange messages know of their targets, per pair of their layout.
+    """The knowledge that observers have of their targets by messages, per pair of their layout.
 
     Attributes:
         age: (pairs, B) time since the newest state that has arrived was measured, in s; inf where none has.

@@ -24,7 +24,7 @@ _PROBES = 256
 
 
 class Certificate:
-    """What is certain of agents of one model, from a state known at some instant and the time since.
+    """Certified boxes of agents of one model, from a state known at some instant and the time since.
 
     Inputs have to be within the model's limits.
 
@@ -68,7 +68,7 @@ class Certificate:
 
     @property
     def certified(self) -> bool:
-        """Whether every component has a bound."""
+        """True if every component has a bound."""
         return not self.reason
 
     def radius(self, age: FloatArray) -> FloatArray:
@@ -92,7 +92,7 @@ class Certificate:
         return self._table.at(age)
 
     def box(self, x: FloatArray, age: FloatArray, t: FloatArray | float = 0.0) -> Box:
-        """Where the state is for certain.
+        """The box that is certain to hold the state.
 
         Args:
             x: (n, B) known states.

@@ -19,7 +19,7 @@ Take: TypeAlias = Callable[[IntArray, IntArray, FloatArray], None]
 
 @runtime_checkable
 class Estimator(Protocol):
-    """How estimates are made of messages; one class is all that an estimator of your own needs.
+    """Makes estimates from messages; one class is all that an estimator of your own needs.
 
     `Networked` stores and forwards stamped states anyway, predicts them, and clips every estimate into the box that
     they certify. So an estimator only says what more is sent, and which estimates it proposes.

@@ -33,7 +33,7 @@ from khop_env.observers.wire import EstimatorName, Known, Message, NumberFormat,
 
 
 class ObserverNode:
-    """What one agent knows of all agents within k hops, from its own messages only.
+    """The observers of one agent: its knowledge of all agents within k hops, from its own messages only.
 
     With the estimator "relay" it keeps and passes on the freshest state of each and predicts it with f; "ppso" runs the
     paper's state and input observers by implicit steps, one a round, on what was heard last. Both report estimates
@@ -179,7 +179,7 @@ class ObserverNode:
             del self._early[message.sender]
 
     def message(self) -> Message:
-        """What to send in this round: before anything of this round is received, so that rounds are the same for all.
+        """The message of a round: made before anything of this round is received, so that rounds are the same for all.
 
         What came late, of earlier rounds, may be received before, to be passed on at once.
 
@@ -261,7 +261,7 @@ class ObserverNode:
         return True
 
     def estimates(self, t: float) -> dict[str, Estimate]:
-        """What is known of each target, by its id, at time `t`: that of the last update or later; ends the round.
+        """The estimates of all targets, by id, at time `t`, that of the last update or later; ends the round.
 
         Raises:
             ValueError: for a time before the last update.

@@ -23,7 +23,7 @@ _MOST_INTERVALS = 100_000
 
 
 class Estimate(NamedTuple):
-    """What a node says about a target.
+    """A node's estimate of a target.
 
     Attributes:
         estimate: (n_i,) of its state.

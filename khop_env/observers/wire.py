@@ -45,7 +45,7 @@ _PPSO = 16
 
 
 class Known(NamedTuple):
-    """What a message says about another agent.
+    """The part of a message about another agent.
 
     Attributes:
         stamp: when that agent measured its state, in s by its clock.
@@ -60,7 +60,7 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Message:
-    """What an agent broadcasts in a round. Agents are indices here; arrays have the length n_i of their agent's state.
+    """The broadcast of an agent in a round. Agents are indices here; arrays have the length n_i of their agent's state.
 
     Attributes:
         design: the observers of the whole fleet.

@@ -144,7 +144,7 @@ class AgentModel:
         return math.nan
 
     def drift_growth(self, region: FloatArray | None = None) -> Growth | None:
-        """How fast two solutions of the drift may part; None, the default, if the model doesn't say.
+        """A bound on how fast two solutions of the drift may part; None, the default, if the model doesn't say.
 
         With it, what was known of an agent some time ago is a bound on its state now (`observers.Certificate`), however
         messages were lost in between. Without it, or outside its region, nothing is certified.

@@ -25,7 +25,7 @@ Amplitude: TypeAlias = float | tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Where one disturbance acts.
+    """The components on which one disturbance acts.
 
     Attributes:
         index: Components of the flat state, shape (C,).

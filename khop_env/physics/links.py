@@ -52,7 +52,7 @@ class Links:
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether every link has a link back, as in an undirected graph."""
+        """True if every link has a link back, as in an undirected graph."""
         return all((receiver, sender) in self.index for sender, receiver in self.index)
 
     @cached_property

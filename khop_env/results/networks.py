@@ -35,7 +35,7 @@ _LEAST_STEPS = 4  # of the simulator in a period, so that errors between message
 
 @dataclass(frozen=True)
 class NetworkRow:
-    """What one estimator makes of one network.
+    """The results of one estimator over one network.
 
     Errors and bounds are of positions, over all pairs of an agent and another up to k hops away, neighbours included,
     over all episodes but for their first quarter, in which estimates start. Violations are counted in all states, from

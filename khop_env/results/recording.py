@@ -30,7 +30,7 @@ _TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.070000
 
 
 class StoppedError(RuntimeError):
-    """What is recorded can't go on, for a reason that isn't the observers' or the plant's."""
+    """The recorded run can't go on, for a reason that isn't the observers' or the plant's."""
 
 
 Failure = FunnelError | SolveError | StoppedError

@@ -186,7 +186,7 @@ class Scenario:
 
     @cached_property
     def initial(self) -> InitialSet:
-        """Where states start."""
+        """The set in which states start."""
         return InitialSet(np.asarray(self.center), np.asarray(self.radius), self.arena, self.fleet.position_index)
 
     @cached_property

@@ -44,7 +44,7 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Arena:
-    """What tasks need to know about a scenario's space.
+    """The space in which agents of a scenario move, for tasks.
 
     Attributes:
         radius: of every agent, which is a disc (a ball in three dimensions), in m.

@@ -1,4 +1,4 @@
-"""Where states start."""
+"""The set in which states start."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from khop_env.simulation.arena import Arena
 
 @dataclass(frozen=True, eq=False)
 class InitialSet:
-    """Where states start: uniformly in a box. Its centre is the observers' common first guess.
+    """The set in which states start: uniformly in a box. Its centre is the observers' common first guess.
 
     Attributes:
         center: (n,) in the states' units.

@@ -98,6 +98,11 @@ def test_every_link_leads_somewhere(pages):
     assert not faults, "\n".join(faults)
 
 
+def test_pages_that_the_changelog_names_are_links(pages):
+    assert re.search(r"docs/\w+/\w+\.md", pages["CHANGELOG.md"])
+    assert re.findall(r"docs/\w+/\w+\.md", pages["docs/changelog.md"]) == []
+
+
 def test_no_image_is_left_over(pages):
     shown = {
         posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
