@@ -22,7 +22,7 @@ SHORTER = {  # what makes a command take seconds; the code that it runs is the s
     "khop network": "--networks wifi --episodes 1 --duration 1",
     "khop iss": "--episodes 1 --duration 0.5",
     "khop test": "--steps 20",
-    "khop bench": "--quick",
+    "khop bench": "--quick --only solve,scipy,training",
 }
 NEEDS = {  # what is refused, and the extra that the refusal names
     "khop train": "rl",
