@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from khop_env.brief import BOUND_REACHED, ratio_text
 from khop_env.commands.common import (
     INTERRUPTED,
     EnvironmentArgument,
@@ -25,10 +26,12 @@ from khop_env.commands.common import (
     shielded_name,
     with_network,
 )
-from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
+from khop_env.terminal import NEARLY_REACHED, Progress, folded, print_table, print_text, say, waiting
 
 if TYPE_CHECKING:
     from agents.comparison import Comparison, Row
+    from khop_env.scenarios import Scenario
+    from khop_env.tasks import Task
 
 
 def evaluate(
@@ -40,8 +43,8 @@ def evaluate(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
             "go_to_goal, keep_right, orca and robust_barrier in navigation_v0; classes of your own, "
-            "my_file.py:MyPolicy; any of them in a safety filter, filter:tanh. By default tanh, linear, zero and "
-            "random, or go_to_goal, zero and random."
+            "my_file.py:MyPolicy; any of them in a safety filter, filter:tanh. By default tanh, linear (where "
+            "a task has edges) or go_to_goal, zero and random."
         ),
     ] = None,
     observe: Annotated[
@@ -104,12 +107,14 @@ def evaluate(
             raise ValueError("--csv and --json: choose one of them")
         require_figure(figure)
         task = find_task(environment)
-        default = f"{task.default_policy or 'tanh,linear'},zero,random"
         arguments = environment_arguments(env, task, {"observe": "--observe"})
         networks = [] if network is None else split_specs(network, "--network", "network")
         single = with_network(arguments, network, estimator)  # refuses two choices
         arguments = single if len(networks) < 2 else with_network(arguments, None, estimator)
         chosen = None if scenario is None else load(scenario)
+        default = f"{task.default_policy or 'tanh,linear'},zero,random"
+        if policies is None and not _laws_act(task, chosen, arguments):
+            default = "zero,random"
         names = [shielded_name(policy, shield) for policy in split_specs(policies or default, "--policies", "policy")]
         if observe is None:
             bounded = any(needs(make_policy(name)).bounds for name in names)
@@ -169,6 +174,19 @@ def evaluate(
         raise typer.Exit(status)
 
 
+def _laws_act(task: Task | type[Task], scenario: Scenario | None, arguments: Mapping[str, Any]) -> bool:
+    """Whether a task has a policy of its own, or edges along which laws act; if not, say what is played instead."""
+    from khop_env.registry import environments, make_batched
+
+    name = f"{task.name}_v{task.version}"
+    if task.default_policy is not None or name in environments():
+        return True
+    if len(make_batched(task, scenario, **arguments).task.edges):
+        return True
+    say(f"khop: {name} has no task edges, along which laws act: zero and random play; choose others by --policies")
+    return False
+
+
 def _command(environment: str, options: Mapping[str, object], env: Sequence[str]) -> str:
     """That makes the same recording; the number of workers isn't in it, which changes nothing."""
     words = ["khop", "evaluate", environment]
@@ -214,8 +232,11 @@ def print_comparison(comparison: Comparison) -> None:
     if networked:
         where += f" over a network ({comparison.network}), estimator {comparison.estimator}"
     title = f"{where}, {comparison.planned} episodes, the same for every row"
+    guarantee = "bound (of all observers, below 1 by guarantee)"
+    if networked:
+        guarantee = f"certified bound (at most 1 by guarantee; {NEARLY_REACHED})"
     if comparison.rows[0].episodes.outcomes:
-        _print_outcomes(comparison, title)
+        _print_outcomes(comparison, title, guarantee)
         return
     rows: list[tuple[str, ...]] = []
     for row, heading in _by_network(comparison):
@@ -233,17 +254,14 @@ def print_comparison(comparison: Comparison) -> None:
                 f"{seen['final_task_error']:.3g}",
                 "never" if settling is None else f"{settling:.3g}",
                 f"{seen['effort']:.3g}",
-                *[f"{seen['max_normalized_disagreement']:.3f}"] * (not no_disagreement),
-                f"{seen['max_error_to_bound']:.3f}",
+                *[ratio_text(seen["max_normalized_disagreement"])] * (not no_disagreement),
+                ratio_text(seen["max_error_to_bound"], BOUND_REACHED if networked else 0.0),
             )
         )
     unit = comparison.rows[0].env.error_unit
     ratios = ("e / bound",) if no_disagreement else ("|e|", "e / bound")
     header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", *ratios)
     disagreement = "|e|: largest |xi| / rho" + (" of what agents hold" if networked else "")
-    guarantee = "bound (of all observers, below 1 by guarantee)"
-    if networked:
-        guarantee = "certified bound (at most 1 by guarantee)"
     print_table(header, rows, title)
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
@@ -253,9 +271,10 @@ def print_comparison(comparison: Comparison) -> None:
     )
 
 
-def _print_outcomes(comparison: Comparison, title: str) -> None:
+def _print_outcomes(comparison: Comparison, title: str, guarantee: str) -> None:
     """The table of an environment in which agents may collide."""
     rows: list[tuple[str, ...]] = []
+    networked = comparison.network is not None
     began_anew = any(row.summary()["infeasible"] for row in comparison.rows)
     for row, heading in _by_network(comparison):
         rows += heading
@@ -270,7 +289,7 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
                 _mean(seen, "intervention", ".3f"),
                 *["" if filtered is None else f"{100.0 * seen['infeasible']:.2g}"] * began_anew,
                 f"{seen['mean_return']:.2f}" + ("" if seen["ci95"] is None else f"\n±{seen['ci95']:.2f}"),
-                f"{seen['max_error_to_bound']:.3f}",
+                ratio_text(seen["max_error_to_bound"], BOUND_REACHED if networked else 0.0),
             )
         )
     header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)")
@@ -286,7 +305,7 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
         "episodes; distance: smallest of two agents' centres; changed: by a filter or barrier, of each agent's inputs, "
         "mean over time; "
         f"{infeasible if began_anew else ''}return: mean over agents of an episode's sum; e / bound: "
-        "largest estimation error over its bound (below 1 by guarantee)"
+        f"largest estimation error over its {guarantee}"
     )
 
 
@@ -308,7 +327,9 @@ def _name(row: Row, comparison: Comparison) -> str:
     """Policy, mode, and the number of episodes if some are missing."""
     count = len(row.episodes.seed)
     few = "" if count == comparison.planned else f"\n({count} episodes)"
-    return f"{folded(row.policy)} on {row.observe}{few}"
+    name = folded(row.policy)
+    space = "\n" if "\n" in name else " "
+    return f"{name}{space}on {row.observe}{few}"
 
 
 def _by_network(comparison: Comparison) -> Iterator[tuple[Row, list[tuple[str, ...]]]]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from khop_env.brief import ratio_text
 from khop_env.observers import FloatArray
 from khop_env.physics import hops_from_targets
 from khop_env.results.metrics import ROUNDING
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 # M. Okabe and K. Ito, Color Universal Design, 2008: distinguishable for colour-blind readers; without yellow (too pale)
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#8C8C8C")
 _ERROR, _DISAGREEMENT = COLORS[0], COLORS[3]
+_PALE = 0.4
 _BY_HOPS = (COLORS[2], COLORS[0], COLORS[3], *COLORS[4:])
 _MOST_LABELS = 12  # agents with a colour each in panel (a)
 _MOST_POINTS = 500_000  # plotted in panel (a)
@@ -97,7 +99,9 @@ def _headline(recording: Recording, scenario: Scenario) -> str:
     if isinstance(recording.states, MessageRecord) and recording.error is None:
         largest, pairs = float(extremes.relative[0]), recording.states.layout.pairs
         kept = "inside all certified boxes" if largest <= 1.0 + ROUNDING else "a certified box was left"
-        return f"{scenario.name}: {kept}; largest |error| / bound = {_digits(largest)} over all {pairs} pairs"
+        return (
+            f"{scenario.name}: {kept}; largest |error| / bound = {ratio_text(largest, ROUNDING)} over all {pairs} pairs"
+        )
     ratios = float(np.maximum(extremes.normalized, extremes.input_normalized)[0])  # nan if any is
     over = f"over all {recording.states.layout.pairs} pairs"
     if isinstance(recording.states, ObserverRecord) and recording.states.cut_off.any():
@@ -105,11 +109,7 @@ def _headline(recording: Recording, scenario: Scenario) -> str:
     if recording.error is not None:
         return f"{scenario.name}: stopped at t = {recording.time[-1]:.4g} s, {_reason(recording)}"
     kept = "inside all funnels" if ratios < 1.0 else "funnels left"
-    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {_digits(ratios)} {over}"
-
-
-def _digits(ratio: float) -> str:
-    return f"{ratio:.3f}" if round(ratio, 3) != 1.0 else f"{ratio:.12g}"  # never 1.000 for another number
+    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {ratio_text(ratios)} {over}"
 
 
 def _reason(recording: Recording) -> str:
@@ -272,10 +272,11 @@ def _draw_bounds(axes: Axes, recording: Recording, record: MessageRecord, agent:
         ]
         links = f"{hops} link{'s' if hops > 1 else ''}"
         error, bound = np.abs(record.error[:, columns]).max(axis=1), record.bound[:, columns].max(axis=1)
-        axes.plot(record.time, np.where(bound < np.inf, bound, np.nan), color=color, linestyle=(0, (5, 2)))
+        drawn = np.where((bound > 0.0) & (bound < np.inf), bound, np.nan)  # a gap where it is 0: the axis has none
+        axes.plot(record.time, drawn, color=color, alpha=_PALE)  # pale: dashes get lost in teeth of single messages
         axes.plot(record.time, np.where(error > 0.0, error, np.nan), color=color, linewidth=1.0, label=links)
     axes.plot([], [], color="#333333", label="largest |error|")
-    axes.plot([], [], color="#333333", linestyle=(0, (5, 2)), label="largest bound")
+    axes.plot([], [], color="#333333", alpha=_PALE, label="largest bound")
     low, high = axes.get_ylim()
     axes.set_ylim(max(low, 1e-6 * high), high * (high / max(low, 1e-6 * high)) ** 0.2)  # room for the legend
     axes.set_xlim(0.0, float(record.time[-1]) or 1.0)
