@@ -13,7 +13,7 @@ import numpy as np
 
 from agents.outcomes import Outcomes
 from agents.policies import make_policy
-from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds
+from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds, require_policy
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv
 from khop_env.observers import FloatArray
@@ -183,7 +183,7 @@ def play(
         ValueError: if `seeds` is empty, or the policy doesn't fit the environment.
     """
     batched = batched_of(env)
-    _require_policy(policy, name)
+    require_policy(policy, name)
     require_seeds(seeds)
     parts = []
     for first in range(0, len(seeds), batched.num_envs):
@@ -271,21 +271,6 @@ def require_seeds(seeds: Sequence[int]) -> None:
         raise ValueError(f"seeds must be one per episode, e.g. range(100); got {seeds!r}")
     if not len(seeds):
         raise ValueError("no seeds given; expected one per episode, e.g. range(100)")
-
-
-def _require_policy(policy: object, name: str) -> None:
-    """Check that an object has the methods of a policy.
-
-    Raises:
-        TypeError: if it doesn't; the message says what a policy needs.
-    """
-    if isinstance(policy, type):
-        raise TypeError(f"policy {name!r} is the class {policy.__name__}: pass an instance")
-    if not all(callable(getattr(policy, method, None)) for method in ("reset", "act")):
-        how = "a policy has reset(env, seeds) and act(observations); agents.make_policy makes one from a name"
-        if callable(getattr(policy, "predict", None)):
-            how = "agents.sb3_policy turns a Stable-Baselines3 model into a policy"
-        raise TypeError(f"policy {name!r} is of type {type(policy).__name__}: {how}")
 
 
 def _by_agent(env: BatchedEnv, actions: object) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from agents.others import side_by_side
-from agents.policy import EnvDescription, Observations
+from agents.policy import EnvDescription, Observations, require_description, require_reset
 from agents.scripted import Reader
 from agents.velocity_law import VELOCITY_INPUTS
 from khop_env.env.layout import Float32Array
@@ -38,6 +38,7 @@ class GoToGoal:
         Raises:
             ValueError: if an agent has no goal.
         """
+        require_description(env)
         self._fleet, self._sizes = Fleet(list(env.models.values())), env.action_sizes
         self._reader = Reader(env, self._fleet)
         self._models = dict(env.models)
@@ -53,6 +54,7 @@ class GoToGoal:
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """Inputs as fractions of their limits."""
+        require_reset(self, "_fleet")
         shape = next(iter(observations.values())).shape[:-1]
         flat = side_by_side(observations, tuple(self._models))
         states = self._reader.view(flat, None).x

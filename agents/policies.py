@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, get_type_hints
 
@@ -39,6 +41,7 @@ FILTER_OPTIONS = {
     "dead_reckoning": bool,
 }
 """Options of the safety filter in a policy's name, and their types."""
+_LATE = re.compile(f"[:,]((?:{'|'.join(FILTER_OPTIONS)})=[^,:]*)")
 POLICIES = (*LAWS, *FLOOR)
 """Names of the scripted policies."""
 
@@ -177,10 +180,22 @@ def _filter(spec: str, argument: str) -> SafetyFilter:
     found = _options(options, FILTER_OPTIONS, f"policy {spec!r}")
     if colon and not inside:
         raise ValueError(f"policy {spec!r}: expected {FILTER}:OPTION=VALUE,...:POLICY; there is no policy")
+    order = _in_order(options, inside)
+    if order and is_object_name(inside.partition(",")[0]):
+        raise ValueError(f"policy {spec!r}: {order}")
     try:
         return shielded(inside or "keep_right", **found)
     except ValueError as error:
-        raise ValueError(f"policy {spec!r}: {error}") from error
+        raise ValueError(f"policy {spec!r}: {error}{'; ' * bool(order)}{order}") from error
+
+
+def _in_order(options: str, inside: str) -> str:
+    """What to write where options of the filter come after the policy; "" where none do."""
+    late = _LATE.findall(inside)
+    if not late or inside.partition(":")[0] in (FILTER, *FLOOR):  # some of which have a margin of their own
+        return ""
+    options = ",".join(filter(None, [options, *late]))
+    return f"options of the filter come before the policy: {FILTER}:{options}:{_LATE.sub('', inside)}"
 
 
 def _options(text: str, known: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -193,6 +208,13 @@ def _options(text: str, known: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _user_policy(spec: str) -> Policy:
+    source, _, name = spec.rpartition(":")
+    if source and "=" in name and os.sep not in name:
+        known = name.partition(",")[0]
+        raise ValueError(
+            f"policy {spec!r}: a policy of your own takes no options here; set them in the file, "
+            f"policy = {known}(...), and name {source}:policy"
+        )
     loaded = load_object(spec)
     policy = called(spec, loaded) if isinstance(loaded, type) else loaded
     if not (callable(getattr(policy, "reset", None)) and callable(getattr(policy, "act", None))):

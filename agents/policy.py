@@ -95,7 +95,15 @@ class Policy(Protocol):
 
 
 def describe(env: object) -> EnvDescription:
-    """The static description of an environment of any kind of this library, wrapped or not."""
+    """The static description of an environment of any kind of this library, wrapped or not.
+
+    That of an environment with a safety filter, e.g. a `ShieldedEnv`, is what the filter leaves of the one inside.
+
+    Raises:
+        TypeError: if `env` isn't an environment of khop_env.
+    """
+    if (inside := _inside_filter(env)) is not None:
+        return inside
     batched = batched_of(env)
     fleet, sizes = batched.fleet, batched.action_offset[1:] - batched.action_offset[:-1]
     disturbance = batched.simulator.disturbance
@@ -119,6 +127,62 @@ def describe(env: object) -> EnvDescription:
         apart=_apart(batched),
         radius=None if arena is None else arena.radius,
     )
+
+
+def _inside_filter(env: object) -> EnvDescription | None:
+    """The description that a safety filter has left of an environment; None for one without a filter."""
+    for _ in range(100):  # nested wrappers
+        found = getattr(getattr(env, "filter", None), "inside", None)
+        if isinstance(found, EnvDescription):
+            return found
+        env = next((layer for name in ("env", "venv") if (layer := getattr(env, name, None)) is not None), None)
+    return None
+
+
+def require_policy(policy: object, name: str | None = None) -> None:
+    """Check that an object has the methods of a policy.
+
+    Args:
+        policy: the object.
+        name: by which the caller knows it.
+
+    Raises:
+        TypeError: if it doesn't; the message says what a policy needs.
+    """
+    which = "the policy" if name is None else f"policy {name!r}"
+    if isinstance(policy, type):
+        raise TypeError(f"{which} is the class {policy.__name__}: pass an instance")
+    if not all(callable(getattr(policy, method, None)) for method in ("reset", "act")):
+        how = "a policy has reset(env, seeds) and act(observations); agents.make_policy makes one from a name"
+        if callable(getattr(policy, "predict", None)):
+            how = "agents.sb3_policy turns a Stable-Baselines3 model into a policy"
+        raise TypeError(f"{which} is of type {type(policy).__name__}: {how}")
+
+
+def require_description(env: object) -> None:
+    """Refuse what isn't the description of an environment, which `reset` of a policy takes.
+
+    Raises:
+        TypeError: naming what it is, and what to do.
+    """
+    if not isinstance(env, EnvDescription):
+        raise TypeError(
+            f"policy.reset(env, seeds): expected an EnvDescription, describe(env); got {type(env).__name__}"
+        )
+
+
+def require_reset(policy: object, attribute: str) -> None:
+    """Refuse to act before the reset.
+
+    Args:
+        policy: that is to act.
+        attribute: that its reset sets.
+
+    Raises:
+        ValueError: if it isn't there.
+    """
+    if not hasattr(policy, attribute):
+        raise ValueError(f"{type(policy).__name__} knows no environment yet: call reset(describe(env), seeds) first")
 
 
 def _euler_steps(batched: BatchedEnv) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.laws import make_law
-from agents.policy import EnvDescription, Observations
+from agents.policy import EnvDescription, Observations, require_description, require_reset
 from agents.tuned import sampled_gain, tuned_parameters
 from agents.velocity_law import VelocityLaw
 from khop_env.env.layout import Float32Array
@@ -23,10 +23,12 @@ class ZeroPolicy:
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Store the action sizes."""
+        require_description(env)
         self._sizes = env.action_sizes
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """Zero actions."""
+        require_reset(self, "_sizes")
         return {
             agent: np.zeros((*observation.shape[:-1], self._sizes[agent]), np.float32)
             for agent, observation in observations.items()
@@ -38,11 +40,13 @@ class RandomPolicy:
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Seed the generators."""
+        require_description(env)
         self._sizes = env.action_sizes
         self._generators = [np.random.default_rng(int(seed)) for seed in seeds]
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """New random actions for every environment."""
+        require_reset(self, "_sizes")
         batch = next(iter(observations.values())).shape[:-1]
         width = sum(self._sizes[agent] for agent in observations)
         rows = [generator.uniform(-1.0, 1.0, width) for generator in self._generators]
@@ -92,6 +96,7 @@ class LawPolicy:
         Raises:
             ValueError: if no agent has a task edge, along which a law acts.
         """
+        require_description(env)
         if not any(slot.task_edge for layout in env.layouts.values() for slot in layout.slots):
             raise ValueError(
                 f"{self.name} acts along task edges, and agents of {env.environment} have none; take another policy, "
@@ -108,6 +113,7 @@ class LawPolicy:
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """The law's inputs as fractions of their limits."""
+        require_reset(self, "_env")
         shape = next(iter(observations.values())).shape[:-1]
         flat = np.concatenate(
             [np.asarray(observations[agent]).reshape(-1, observations[agent].shape[-1]) for agent in self._env.agents],

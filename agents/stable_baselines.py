@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.policy import EnvDescription, Observations, Policy
+from agents.policy import EnvDescription, Observations, Policy, require_description, require_reset
 from khop_env.env.layout import Float32Array
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ class _SB3Policy:
         Raises:
             ValueError: if observations or actions have another shape than the model's.
         """
+        require_description(env)
         expected = self._model.observation_space.shape, self._model.action_space.shape
         for agent, layout in env.layouts.items():
             if ((len(layout),), (env.action_sizes[agent],)) != expected:
@@ -57,6 +58,7 @@ class _SB3Policy:
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """The model's actions."""
+        require_reset(self, "_state")
         stacked = np.stack([np.asarray(observations[agent]) for agent in observations])
         rows = stacked.reshape(-1, stacked.shape[-1])
         normalised = self._model.get_vec_normalize_env()

@@ -12,7 +12,7 @@ import numpy as np
 
 from agents.learning.policy_file import Layers, PolicyFileError, read_policy, write_policy
 from agents.learning.scaling import RATE, ObservationScaler
-from agents.policy import EnvDescription, Observations
+from agents.policy import EnvDescription, Observations, require_description, require_reset
 from khop_env.env.layout import Float32Array
 
 PRETRAINED = Path(__file__).with_name("pretrained")
@@ -55,6 +55,7 @@ class LearnedPolicy:
         Warns:
             UserWarning: if it was trained in a safety filter and is played without one.
         """
+        require_description(env)
         if env.environment != self.environment:
             raise PolicyFileError(f"it was trained for {self.environment}, not for {env.environment}")
         sizes, columns = sorted(set(env.action_sizes.values())), columns_of(env)
@@ -106,6 +107,8 @@ class LearnedPolicy:
         self._before = stacked
         if "" in self.networks:
             return dict(zip(observations, self._forward(features, self.networks[""]), strict=True))
+        if not self._types:
+            raise ValueError("LearnedPolicy knows no environment yet: call reset(describe(env), seeds) first")
         return {
             agent: self._forward(row, self.networks[self._types[agent]])
             for agent, row in zip(observations, features, strict=True)
@@ -156,6 +159,7 @@ class PretrainedPolicy:
         Raises:
             PolicyFileError: if none is shipped for this environment and scenario, or it doesn't fit.
         """
+        require_description(env)
         if self.environment not in (None, env.environment):
             raise PolicyFileError(f"the policy for {self.environment} doesn't fit {env.environment}")
         path = PRETRAINED / f"{pretrained_name(env.environment, env.scenario)}.npz"
@@ -169,6 +173,7 @@ class PretrainedPolicy:
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """Actions (..., m) in [-1, 1] by agent."""
+        require_reset(self, "_policy")
         return self._policy.act(observations)
 
     def about_for(self, scenario: str) -> Mapping[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -64,8 +65,22 @@ def read_policy(path: Path) -> dict[str, Any]:
     try:
         return _fields(read_arrays(path, MOST_BYTES))
     except (ValueError, TypeError, KeyError, RecursionError) as error:
+        if _is_sb3(path):
+            raise PolicyFileError(
+                f"{path} is a model of Stable-Baselines3: in a file my_sb3.py write policy = "
+                f"agents.sb3_policy(PPO.load({str(path)!r})), and name my_sb3.py:policy"
+            ) from error
         why = f"it has no {error}" if isinstance(error, KeyError) else error
         raise PolicyFileError(f"{path} isn't a policy that khop train wrote ({why})") from error
+
+
+def _is_sb3(path: Path) -> bool:
+    """Whether `model.save(path)` of Stable-Baselines3 wrote a file; nothing of it is unpacked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "policy.pth" in archive.namelist()
+    except Exception:  # zipfile raises various exceptions for damaged files
+        return False
 
 
 def _fields(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:

@@ -203,7 +203,8 @@ def bodies(agent: str, env: EnvDescription, start: int, radius: float | None) ->
         if "radius" not in names:
             raise ValueError(
                 f"observations of {env.environment} have no column 'radius', so that it isn't known how large agents "
-                "are: give SafetyFilter or shielded() radius=, in m"
+                "are: give their radius in m, in Python shielded(policy, radius=0.2), on the command line "
+                "filter:radius=0.2:POLICY or --shield certified,radius=0.2"
             )
         column = start + layout.index("radius")
     count = len({name.partition(".")[0] for name in names if name.startswith("obstacle")})

@@ -66,7 +66,7 @@ class ShieldedEnv(BaseParallelWrapper[str, Float32Array, Float32Array]):
         """Refused: whoever steps the environment inside passes the filter by."""
         raise TypeError(
             "a ShieldedEnv isn't for functions that step the environment inside, such as evaluate(): give them "
-            f"env.unwrapped and the policy shielded(policy, {self.filter.margin!r}); env.filter.inside describes it"
+            f"env.unwrapped and the policy shielded(policy, {self.filter.margin!r}); describe(env) describes it"
         )
 
     @property

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.others import Others, side_by_side
-from agents.policy import EnvDescription, Observations, Policy
+from agents.policy import EnvDescription, Observations, Policy, require_description, require_policy, require_reset
 from agents.safety.checks import checked, is_number, require_state
 from agents.safety.columns import ANNOUNCED, DRIFT, Margin, read_columns, without_bounds
 from agents.safety.driving import drive
@@ -86,6 +86,7 @@ class SafetyFilter:
             show, which then stops. It is never True while the theorem's assumptions hold.
 
     Raises:
+        TypeError: for a policy without `reset` or `act`.
         ValueError: for a margin, gamma or radius out of range, anchors that aren't needed, or a filter as the policy.
     """
 
@@ -113,6 +114,7 @@ class SafetyFilter:
                 "the policy is in a safety filter already, which another would undo: leave one of them out"
             )
         self.policy: Policy = _NoPolicy() if policy is None else policy
+        require_policy(self.policy)
         self.margin, self.gamma = as_margin(margin), float(gamma)
         if announce and self.margin != "certified":
             raise ValueError(f"announce=True is for margin='certified'; got margin={margin!r}")
@@ -141,6 +143,7 @@ class SafetyFilter:
         Raises:
             ValueError: if the filter or the policy inside doesn't fit the environment; the message says why.
         """
+        require_description(env)
         brakes = any(type(model) not in DRIFT for model in env.models.values())
         others = _held(env) if self.dead_reckoning else None
         if brakes:
@@ -272,8 +275,7 @@ class SafetyFilter:
             self._others.set_state(state)
 
     def _require_reset(self) -> None:
-        if not hasattr(self, "_env"):
-            raise ValueError("the safety filter knows no environment yet: call reset(describe(env), seeds) first")
+        require_reset(self, "_env")
 
     def _wanted(self, agent: str, batch: int) -> Float32Array:
         """(B, M) what the policy inside wants of an agent, with zeros after its inputs."""

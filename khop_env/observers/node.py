@@ -136,6 +136,7 @@ class ObserverNode:
         self._open = False  # whether the round's solve is still to come
         self._round = self._updates = 0
         self._x, self._g = np.full(model.n, math.nan), np.full(model.n, math.nan)
+        self._most = model.input_limit * (1.0 + 1e-6)  # inputs may have been rounded to float32
         self._newest: dict[int, float] = {}
         self._early: dict[int, Message] = {}
         self._heard: dict[int, FloatArray] = {}
@@ -150,16 +151,22 @@ class ObserverNode:
         Args:
             t: in s, never less than before.
             own_state: (n_a,) as measured now.
-            own_input: (m_a,) u that was in force until now.
+            own_input: (m_a,) u that was in force until now, as it was applied: within the model's `input_limit`.
 
         Raises:
-            ValueError: for a value that is misshapen or not finite, or a time that runs backwards or far ahead.
+            ValueError: for a value that is misshapen or not finite, an input beyond its limit, or a time that runs
+                backwards or far ahead.
             SolveError: if an estimate isn't finite any more.
         """
         model = self._design.fleet.models[self._agent]
         dt = self._since(t, "update")
         x = self._own("state", own_state, tuple(model.states))
         u = self._own("input", own_input, tuple(model.inputs))
+        if (np.abs(u) > self._most).any():
+            raise ValueError(
+                f"node of {self.id!r}: its input {_short(u)} is beyond input_limit {_short(model.input_limit)}; "
+                "certified bounds assume it isn't: clip what goes to the motors, and pass what was applied"
+            )
         g = np.array(model.input_map(np.array([t]), x[None], u[None])[0], np.float64)
         self._end_round()
         moved = [target.moved(target.freshest.state, self.time, dt) for target in self._targets.values()]
@@ -220,11 +227,13 @@ class ObserverNode:
             Whether it is of use: False for one that is no newer than what came from its sender before.
 
         Raises:
-            ValueError: for a message of another fleet, of an agent that isn't heard, of another estimator, rounded more
-                than the bounds allow for, or too far ahead of this clock or behind it.
+            ValueError: for what isn't a `Message`, or one of another fleet, of an agent that isn't heard, of another
+                estimator, rounded more than the bounds allow for, or too far ahead of this clock or behind it.
         """
-        ids, sender = self._design.fleet.ids, message.sender
         who = f"node of {self.id!r}"
+        if not isinstance(message, Message):
+            raise ValueError(f"{who}: expected a Message, got {type(message).__name__}: Message.unpack(data, design)")
+        ids, sender = self._design.fleet.ids, message.sender
         if message.design is not self._design and fingerprint(message.design) != fingerprint(self._design):
             raise ValueError(f"{who}: a message of another fleet, {message.design}; this one is {self._design}")
         if sender not in self._senders:
@@ -346,6 +355,10 @@ class ObserverNode:
                 f"node of {self.id!r}: its {what} must be {len(names)} finite numbers {names}; got {value!r}"
             )
         return found
+
+
+def _short(values: FloatArray) -> str:
+    return f"[{', '.join(f'{value:g}' for value in values)}]"
 
 
 def _numbers(value: object) -> FloatArray:

@@ -30,7 +30,7 @@ class FleetPlant:
         disturbance: an attached disturbance (`physics.Disturbance.attach`), or None.
         law: the feedback law, or None for inputs that are held.
         views: builds the law's view; needed with a law.
-        saturated: whether a law's inputs are kept within the models' limits.
+        saturated: whether inputs have to be within the models' limits: a law's are clipped, others refused.
     """
 
     def __init__(
@@ -99,7 +99,8 @@ class FleetPlant:
         """Inputs (m,) or (B, m) that are to be held, checked.
 
         Raises:
-            ValueError: where a law computes the inputs, and for a wrong shape or numbers that aren't finite.
+            ValueError: where a law computes the inputs, for a wrong shape or numbers that aren't finite, and over a
+                network for inputs beyond their limits.
         """
         if self.law is not None:
             raise ValueError("this simulator has a law, which computes the inputs; build it with law=None to give u")
@@ -112,6 +113,14 @@ class FleetPlant:
             bad = np.flatnonzero(~np.isfinite(inputs.reshape(-1, self.fleet.m)).all(axis=0))
             agent, name, unit = self.fleet.input_names()[bad[0]]
             raise ValueError(f"input {name!r} ({unit}) of {agent!r} isn't finite")
+        if self._limit is not None:
+            largest = np.abs(inputs).reshape(-1, self.fleet.m).max(axis=0)
+            for row in np.flatnonzero(largest > self.fleet.input_limit * (1.0 + 1e-6))[:1]:  # may be float32, rounded
+                agent, name, unit = self.fleet.input_names()[row]
+                raise ValueError(
+                    f"input {name!r} of {agent!r} is {largest[row]:g} {unit} in size, beyond its limit "
+                    f"{self.fleet.input_limit[row]:g}, and certified bounds over a network assume it isn't: clip it"
+                )
         return inputs
 
     def _bind(self, state: PlantState) -> FloatArray:

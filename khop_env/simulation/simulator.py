@@ -219,7 +219,8 @@ class Simulator:
             dt: step in s, positive; divided into equal parts where it is too long for a drift
                 (`AgentModel.explicit_step`).
             u: (m,) or (B, m) inputs held over the step, where the simulator has no law; the last ones if left out.
-                They are not clipped: keep them within `input_limit` if the design assumes a bounded input map.
+                They are not clipped: keep them within `input_limit` if the design assumes a bounded input map. Over a
+                network certified bounds assume it, and inputs beyond are refused.
 
         Raises:
             ValueError: for a step that isn't positive or would have too many parts, or inputs that are passed to a

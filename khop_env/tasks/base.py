@@ -129,6 +129,15 @@ class MapCanvas(Protocol):
         ...
 
 
+class _NoEdges:
+    """(0, 2), as long as a task has set no edges: not as an array, whose long description `help` would print."""
+
+    _none = np.zeros((0, 2), np.int64)
+
+    def __get__(self, task: object, owner: type) -> object:
+        return self if task is None else self._none
+
+
 class Task(abc.ABC):
     """A task for a team. A subclass implements `evaluate`; everything else has a default.
 
@@ -151,7 +160,7 @@ class Task(abc.ABC):
     driven_label: ClassVar[str] = "driven agent"
     default_policy: ClassVar[str | None] = None
     defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
-    edges: IntArray = np.zeros((0, 2), np.int64)
+    edges: IntArray = _NoEdges()  # type: ignore[assignment]
     memory: dict[str, FloatArray]
 
     def __init_subclass__(cls, **arguments: object) -> None:

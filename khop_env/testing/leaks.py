@@ -192,7 +192,7 @@ def _require(
         if i not in allowed:
             names = env.layout(ids[i]).names
             column_name = names[column] if column < len(names) else "beyond its layout"
-            known = ", ".join(ids[j] for j in sorted(allowed)) or "none"
+            known = f"only {', '.join(ids[j] for j in sorted(allowed))}" if allowed else "nobody"
             raise Fault(
-                f"{text} changes the observation of {ids[i]!r}, entry {column} ({column_name}); allowed: {known}"
+                f"{text} changes the observation of {ids[i]!r}, entry {column} ({column_name}); {known} may see it"
             )

@@ -162,6 +162,14 @@ def test_crafted_files_are_refused(tmp_path, content, said):
         make_policy(f"ppo:{path}")
 
 
+def test_a_model_of_stable_baselines_is_told_how_to_play(tmp_path):
+    path = tmp_path / "my_model.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("policy.pth", b"weights")
+    with pytest.raises(PolicyFileError, match=r"is a model of Stable-Baselines3: .*PPO.load.*name my_sb3.py:policy"):
+        make_policy(f"ppo:{path}")
+
+
 def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     """By the declared size; a file that declares less than it holds yields no more than it declares."""
     path = tmp_path / "bomb.npz"

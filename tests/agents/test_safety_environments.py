@@ -202,7 +202,7 @@ def test_starts_nearer_than_the_theorem_assumes_are_warned_of(model, distance):
 def test_bodies_of_unknown_size_are_refused():
     """Unless a radius is given."""
     env = describe(make_batched("consensus_v0", CIRCLE, bounds=True))
-    with pytest.raises(ValueError, match=r"no column 'radius'.* give SafetyFilter or shielded"):
+    with pytest.raises(ValueError, match=r"no column 'radius'.* filter:radius=0.2:POLICY"):
         shielded("tanh").reset(env, [0])
     shielded("tanh", radius=0.2).reset(env, [0])
 
@@ -234,6 +234,19 @@ def test_policies_by_name():
         ("filter:gamma=x", "gamma must be of type float; got 'x'"),
         ("filter:gamma=2", "gamma must be above 0 and at most 1"),
         ("filter:tan", "did you mean 'tanh'"),
+        (
+            "filter:linear:gain=2,radius=0.2",
+            "no parameter 'radius'.*come before the policy: filter:radius=0.2:linear:gain=2$",
+        ),
+        (
+            "filter:margin=none:line.py:Middle,radius=0.2",
+            "Middle,radius=0.2': options of .* come before .*: filter:margin=none,radius=0.2:line.py:Middle$",
+        ),
+        (
+            "filter:line.py:Middle,gain=2",
+            "takes no options here; set them in the file, policy = Middle.* line.py:policy",
+        ),
+        ("filter:orca:margin=-1", "margin must be .*; got -1.0$"),
         ("filter:filter", "policy 'filter:filter': the policy is in a safety filter already"),
         ("filter:gamma=0.5:filter:margin=none:zero", "the policy is in a safety filter already"),
     ):

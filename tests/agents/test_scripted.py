@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agents import LAWS, LawPolicy, describe, make_law, make_policy, play
+from agents import LAWS, POLICIES, LawPolicy, describe, make_law, make_policy, play
 from agents.policy import by_agent
 from khop_env.scenarios import LawChoice
 from khop_env.simulation import View
@@ -215,6 +215,16 @@ def test_policies_by_name():
     ):
         with pytest.raises(ValueError, match=said):
             make_policy(spec)
+
+
+@pytest.mark.parametrize("name", [*POLICIES, "filter:tanh", "ppo:pretrained"])
+def test_a_reset_comes_first_and_takes_a_description(name):
+    policy, env = make_policy(name), batched("consensus_v0", num_envs=1)
+    with pytest.raises(ValueError, match=r"knows no environment yet: call reset\(describe\(env\), seeds\) first"):
+        policy.act({agent: np.zeros((1, 4), np.float32) for agent in env.agents})
+    for wrong in (env, env.fleet):
+        with pytest.raises(TypeError, match=f"expected an EnvDescription, describe.env.; got {type(wrong).__name__}"):
+            policy.reset(wrong, [0])
 
 
 def test_shipped_parameters_are_used_and_given_ones_win():

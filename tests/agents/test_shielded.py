@@ -12,6 +12,7 @@ from agents.learning import LearnedPolicy, TrainingConfig
 from agents.learning.environment import training_environment
 from agents.learning.shielded import ShieldedSB3VecEnv
 from agents.learning.training import train
+from agents.navigation import KeepRight
 from agents.policy import by_agent
 from khop_env import make_sb3_vec, navigation_v0
 from khop_env.env import CostsApart
@@ -215,6 +216,30 @@ def test_what_a_shielded_environment_cannot_step_is_refused():
     assert len(apart.step(dict.fromkeys(apart.agents, np.zeros(2, np.float32)))) == 6
     with pytest.raises(ValueError, match="in a safety filter already"):
         shielded(shielded("zero"))
+
+
+def test_a_policy_is_reset_with_what_the_filter_leaves():
+    """Whatever is around the ShieldedEnv; the same loop plays it as any other environment."""
+    inner = navigation_v0.parallel_env(bounds=True, max_cycles=3)
+    env, policy = ShieldedEnv(inner), make_policy("go_to_goal")
+    for each in (env, CostsApart(env)):
+        assert describe(each) is env.filter.inside
+        assert describe(each).shielded
+        assert not any(".bound." in name for name in describe(each).layouts[inner.possible_agents[0]].names)
+    assert not describe(inner).shielded
+    rows = ShieldedSB3VecEnv(make_sb3_vec("navigation_v0", num_envs=2, bounds=True), SafetyFilter(None))
+    assert describe(rows) is rows.filter.inside
+    policy.reset(describe(env), [0])
+    observations, _ = env.reset(seed=0)
+    while env.agents:
+        observations, *_ = env.step(policy.act(observations))
+
+
+def test_a_filter_takes_policies_only():
+    with pytest.raises(TypeError, match="the policy is the class KeepRight: pass an instance"):
+        shielded(KeepRight)
+    with pytest.raises(TypeError, match=r"the policy is of type function: a policy has reset\(env, seeds\)"):
+        shielded(make_policy)
 
 
 @pytest.mark.parametrize("shield", ["certified", None])

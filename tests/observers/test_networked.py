@@ -74,6 +74,17 @@ def chain(models: list, network: Network | str, estimator: str = "relay", k: int
     return Simulator(design, initial, observers=Networked(network, estimator), num_envs=num_envs)
 
 
+def test_inputs_beyond_their_limits_are_refused():
+    """Bounds assume that they aren't; without a network no bound does."""
+    simulator = chain([SingleIntegrator(input_limit=0.5)] * 3, "ideal")
+    for u in (np.full(6, 3.0), np.array([[0.0, 0.0, 3.0, 0.0, 0.0, 0.0]]), np.array([0.0, 0.0, -3.0, 0.0, 0.0, 0.0])):
+        with pytest.raises(ValueError, match=r"'integrator_\d' is 3 m/s in size, beyond its limit 0.5, and certified"):
+            simulator.step(0.05, u)
+    assert simulator.t[0] == 0.0
+    simulator.step(0.05, np.full(6, 0.5, np.float32))
+    Simulator(simulator.design, simulator.initial).step(0.05, np.full(6, 3.0))
+
+
 def test_an_integrator_under_full_input_is_on_the_face():
     simulator = chain([SingleIntegrator(input_limit=1.0)] * 3, "ideal:latency=0.1")
     for _ in range(40):

@@ -264,6 +264,11 @@ def test_what_cannot_be_right_is_refused_and_changes_nothing() -> None:
         (lambda: node.update("soon", np.zeros(4), np.zeros(2)), "the time of update must be a number; got 'soon'"),
         (lambda: node.estimates(None), "must be a number; got None"),
         (lambda: node.update(T, np.zeros(4), [0.0, np.nan]), "its input must be 2 finite numbers"),
+        (
+            lambda: node.update(T, np.zeros(4), [0.0, -6.0]),
+            r"'cart_0': its input \[0, -6\] is beyond input_limit \[1, 1\]",
+        ),
+        (lambda: node.receive(sent[1].pack()), r"expected a Message, got bytes: Message.unpack\(data, design\)"),
         (lambda: node.update(-T, np.zeros(4), np.zeros(2)), "expected 0.0 s, the last time, or later"),
         (lambda: node.update(math.nan, np.zeros(4), np.zeros(2)), "expected 0.0 s, the last time, or later"),
         (lambda: node.update(1.7e9, np.zeros(4), np.zeros(2)), "times are in seconds since the fleet started"),
@@ -278,6 +283,14 @@ def test_what_cannot_be_right_is_refused_and_changes_nothing() -> None:
         small.message()
     with pytest.raises(ValueError, match="sent a state of 'cart_1' beyond largest"):
         small.receive(dataclasses.replace(sent[1], state=np.full(4, 0.6)))
+
+
+def test_an_input_at_its_limit_may_be_rounded() -> None:
+    node = ObserverNode(design_of([SingleIntegrator(1, 0.1), *[SingleIntegrator(1)] * 2]), 0, period=T)
+    assert float(np.float32(0.1)) > 0.1
+    node.update(0.0, [0.0], np.array([0.1], np.float32))
+    with pytest.raises(ValueError, match=r"input \[-0.10001\] is beyond input_limit \[0.1\]"):
+        node.update(T, [0.0], [-0.10001])
 
 
 def test_bad_arguments_are_refused() -> None:

@@ -1,6 +1,7 @@
 """A task of a user's own works wherever a built-in one does, without a line of the library."""
 
 import functools
+import pydoc
 import runpy
 from pathlib import Path
 
@@ -156,6 +157,13 @@ def test_evaluation_and_training():
     trained = train(TrainingConfig(KeepApart(), timesteps=2000, num_envs=2, evaluations=1))
     assert trained.policy.environment == "keep_apart_v0"
     assert np.isfinite(trained.curve[-1].mean_return)
+
+
+def test_its_help_is_about_tasks():
+    """Not about the arrays of NumPy that a task begins with."""
+    said = pydoc.render_doc(khop_env.Task, renderer=pydoc.plaintext)
+    assert "ndarray" not in said
+    assert "multidimensional" not in said
 
 
 def test_mistakes_are_refused():

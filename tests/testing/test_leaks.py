@@ -30,10 +30,10 @@ def observing(part):
     [
         (
             lambda env: env.simulator.x[:, -1],
-            r"the true state of 'drifter_7' changes the observation of 'drifter_\d', ",
+            r"the true state of 'drifter_7' changes the observation of 'drifter_\d', .*; only drifter.* may see it",
         ),
         (lambda env: env.simulator.estimates[:, 0], r"an estimate that '.*' makes changes the observation of "),
-        (lambda env: env.simulator.u[:, 0], r"the simulator's u changes the observation of '.*allowed: none"),
+        (lambda env: env.simulator.u[:, 0], r"the simulator's u changes the observation of '.*; nobody may see it"),
     ],
     ids=["state", "estimate", "input"],
 )
@@ -51,7 +51,10 @@ LOSSY = partial(consensus_v0.parallel_env, "paper", network="lossy:loss=0.5,burs
 @pytest.mark.parametrize(
     ("part", "message"),
     [
-        (lambda env: env.simulator.x[:, 1], r"the true state of 'drifter_0' changes the observation of 'drifter_\d', "),
+        (
+            lambda env: env.simulator.x[:, 1],
+            r"the true state of 'drifter_0' changes the observation of 'drifter_\d', .*; only drifter.* may see it",
+        ),
         (lambda env: env.simulator.state.memory["stamp"][0], r"'.*'s stamp changes the observation of '.*"),
         (lambda env: env.simulator.state.memory["channel.sent"][0, 1], r"the simulator's channel.sent changes"),
         (lambda env: env.simulator.state.memory["channel.newest"][0], r"the simulator's channel.newest changes"),
