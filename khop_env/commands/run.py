@@ -141,7 +141,7 @@ def run(
             episode.observers.estimator.name if estimator and isinstance(episode.observers, Networked) else "",
         ]
         folder = choose_folder(Path("runs") / folder_name(*parts, f"seed{seed}"), out, configuration)
-    with Progress(f"simulating {chosen.name}") as progress:
+    with mistakes(scenario or name), Progress(f"simulating {chosen.name}") as progress:
         recording = record(
             episode.simulator,
             episode.duration,

@@ -12,7 +12,7 @@ import difflib
 import itertools
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -216,6 +216,18 @@ class AgentModel:
             bound[(low != high).any(axis=0)] = np.inf
         return bound
 
+    def check_drift(self) -> None:
+        """Check the drift's shape on a batch in which no number of environments, agents or states is the same.
+
+        Raises:
+            ValueError: The drift can't be evaluated on a batch, or returns a wrong shape.
+        """
+        environments, agents = self.n + 2, self.n + 1
+        x = np.random.default_rng(0).normal(size=(agents, self.n, environments)).transpose(2, 0, 1)  # as in a simulator
+        t = np.zeros((environments, 1))
+        f = self._evaluated(lambda: self.drift(t, x), x, "drift(t, x)")
+        require_shape(self, f, x.shape, f"drift(t, x) on x of shape {x.shape}")
+
     def checked_input_map_bound(self) -> FloatArray:
         """`input_map_bound`, after sampled checks of the input map and checks of the bound.
 
@@ -242,8 +254,23 @@ class AgentModel:
     def _probe(self, t: float, x: FloatArray, u: FloatArray) -> FloatArray:
         """Values of g at inputs (K, m), evaluated as in a simulator: one environment of K agents."""
         states = np.broadcast_to(x, (1, len(u), self.n)).copy()
-        g = self.input_map(np.full((1, 1), t), states, u[None].copy())
+        time, inputs = np.full((1, 1), t), u[None].copy()
+        g = self._evaluated(lambda: self.input_map(time, states, inputs), states, "input_map(t, x, u)")
         return require_shape(self, g, states.shape, "input_map(t, x, u)")[0]
+
+    def _evaluated(self, side: Callable[[], FloatArray], x: FloatArray, what: str) -> FloatArray:
+        """The value of a right-hand side; an error in it says which one it is and how x is indexed."""
+        try:
+            with np.errstate(all="ignore"):
+                return side()
+        except NotImplementedError as error:
+            raise ValueError(str(error)) from error
+        except Exception as error:
+            first = next(iter(self.states))
+            raise ValueError(
+                f"{self.__class__.__name__}.{what} raised {type(error).__name__} ({error}) on x of shape {x.shape}: "
+                f"the states are the last axis, so that {first!r} is x[..., 0], and np.stack takes axis=-1"
+            ) from error
 
     @property
     def n(self) -> int:

@@ -68,7 +68,8 @@ class Fleet:
 
     Raises:
         ValueError: There are no models, an entry isn't a model, positions differ in dimension, agents of one type
-            differ in their states or inputs, or an input map has a wrong shape or contradicts its model's attributes.
+            differ in their states or inputs, a drift or an input map has a wrong shape or can't be evaluated on a
+            batch, or an input map contradicts its model's attributes.
     """
 
     def __init__(self, models: Sequence[AgentModel]) -> None:
@@ -94,6 +95,8 @@ class Fleet:
         self.position_dim = _common_dimension(positions, self.ids)
         self.position_index: IndexArray = np.array(positions) + self.state_offset[:-1, None]
         self.input_limit: FloatArray = np.concatenate([model.input_limit for model in self.models])
+        for group in self.groups:
+            group.model.check_drift()
         self.input_map_bound: FloatArray = np.concatenate(
             [np.tile(group.model.checked_input_map_bound(), group.size) for group in self.groups]
         )

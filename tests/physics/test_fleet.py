@@ -1,5 +1,7 @@
 """The fleet against a loop over its agents."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -155,8 +157,46 @@ def test_malformed_fleets_are_refused() -> None:
 
 
 def test_a_wrong_shape_names_the_model() -> None:
-    with pytest.raises(ValueError, match=r"Wrong.drift\(t, x\) returned shape \(3, 2\), expected \(3, 2, 2\)"):
-        Fleet([Wrong(), Wrong()]).drift(np.zeros(3), np.zeros((3, 4)))
+    with pytest.raises(ValueError, match=r"Wrong.drift\(t, x\) on x .* returned shape \(4, 3\), expected \(4, 3, 2\)"):
+        Fleet([Wrong(), Wrong()])
+
+
+class Indexed(Swing):
+    """A right-hand side by whichever formula a test gives."""
+
+    type = "indexed"
+
+    def __init__(self, drift: Any, input_map: Any = None) -> None:
+        self.formula, self.inputs_formula = drift, input_map
+        super().__init__()
+
+    def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
+        return self.formula(t, x)
+
+    def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
+        return super().input_map(t, x, u) if self.inputs_formula is None else self.inputs_formula(x, u)
+
+
+@pytest.mark.parametrize(
+    ("drift", "message"),
+    [
+        (lambda t, x: np.stack([x[5], -x[6]], axis=-1), r"drift\(t, x\) raised IndexError .* 'x' is x\[..., 0\]"),
+        (lambda t, x: np.stack([x[0], -x[1]]), r"returned shape \(2, 3, 2\), expected \(4, 3, 2\)"),
+        (lambda t, x: np.stack([x[:, 0], -x[:, 1]], axis=-1), r"returned shape \(4, 2, 2\)"),
+        (lambda t, x: np.stack([x[..., 1], -x[..., 0]], axis=0), r"returned shape \(2, 4, 3\)"),
+        (lambda t, x: -x[..., :1], r"returned shape \(4, 3, 1\)"),
+        (lambda t, x: t * x[..., 0], r"returned shape \(4, 3\)"),
+        (lambda t, x: AgentModel.drift(None, t, x), r"has no drift\(t, x\)"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_drift_that_takes_no_batches_is_refused_before_anything_runs(drift: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Fleet([Indexed(drift)])
+
+
+def test_an_input_map_that_takes_no_batches_is_refused_with_the_reason() -> None:
+    with pytest.raises(ValueError, match=r"input_map\(t, x, u\) raised IndexError .* the states are the last axis"):
+        Fleet([Indexed(lambda t, x: -x, lambda x, u: np.stack([u[1], u[2]]))])
 
 
 class Mapped(Swing):
