@@ -15,7 +15,7 @@ import numpy as np
 from agents.evaluation import Episodes, chosen_scenario, play, require_seeds
 from agents.outcomes import interval95, summary
 from agents.policies import Needs, make_policy, needs
-from agents.policy import EnvDescription, describe
+from agents.policy import EnvDescription, describe, in_words
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv
@@ -211,8 +211,8 @@ def compare(
             rows.append((spec, env, needed, network))
             try:
                 policy.reset(env, [0])
-            except ValueError as error:
-                raise ValueError(f"policy {spec!r}: {error}") from error
+            except Exception as error:
+                raise ValueError(in_words(error, spec)) from error
     observers = player.environment(observe[0], *rows[0][2:]).simulator.observers
     over: tuple[str, str] | tuple[()] = ()
     if isinstance(observers, Networked):
@@ -257,7 +257,7 @@ def compare(
     except ModuleNotFoundError:
         raise
     except Exception as error:
-        raise UnfinishedError(str(error), comparison()) from error
+        raise UnfinishedError(in_words(error, *getattr(error, "__notes__", [])[:1]), comparison()) from error
     return comparison()
 
 
@@ -289,11 +289,15 @@ class _Player:
     def __call__(self, task: _Task) -> _Played:
         spec, observe, needed, network, seeds = task
         env, policy = self.environment(observe, needed, network), make_policy(spec)
-        if self.columns is None:
-            return play(env, policy, seeds, name=spec), []
         parts: list[Part] = []
-        recorder = EpisodeRecorder(env, spec, network or self.network(observe, needed), self.columns)
-        return play(env, policy, seeds, name=spec, recorder=recorder, recorded=parts.extend), parts
+        try:
+            if self.columns is None:
+                return play(env, policy, seeds, name=spec), []
+            recorder = EpisodeRecorder(env, spec, network or self.network(observe, needed), self.columns)
+            return play(env, policy, seeds, name=spec, recorder=recorder, recorded=parts.extend), parts
+        except Exception as error:
+            error.add_note(spec)  # a worker's exception comes with it
+            raise
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_made": {}}

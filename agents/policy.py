@@ -12,6 +12,7 @@ import numpy as np
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
+from khop_env.objects import described
 from khop_env.observers import FloatArray
 from khop_env.physics import AgentModel
 from khop_env.simulation import Observe
@@ -143,6 +144,16 @@ def _apart(batched: BatchedEnv) -> float | None:
 def policy_seeds(seeds: Sequence[int]) -> list[int]:
     """Seeds for a policy's own random numbers, from which the episodes' seeds can't be inferred."""
     return [int(np.random.SeedSequence([int(seed), 1]).generate_state(1, np.uint64)[0]) for seed in seeds]
+
+
+def in_words(error: Exception, spec: str = "") -> str:
+    """An error on the way, with the name of the policy that was playing, unless the error's own text has it."""
+    ours = isinstance(error, ValueError) or type(error).__module__.partition(".")[0] in ("khop_env", "agents")
+    if not spec:
+        return str(error) if ours else described(error)
+    if not ours:
+        return f"policy {spec!r} raised {described(error, spec.partition(':')[0])}"
+    return str(error) if repr(spec) in str(error) else f"policy {spec!r}: {error}"
 
 
 def batched_of(env: object) -> BatchedEnv:

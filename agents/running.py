@@ -14,11 +14,10 @@ import numpy as np
 from agents.learning.learned import LearnedPolicy, PretrainedPolicy
 from agents.outcomes import Outcomes
 from agents.policies import make_policy, needs
-from agents.policy import Policy, describe, policy_seeds
+from agents.policy import Policy, describe, in_words, policy_seeds
 from agents.safety import SafetyFilter
 from agents.safety.environments import show_corrections
 from khop_env.env import KHopEnv, Settings
-from khop_env.objects import described
 from khop_env.observers import Extremes, FloatArray, FunnelError, SolveError
 from khop_env.registry import Environment, environments, find_task, make
 from khop_env.results.recording import Drawing, StoppedError
@@ -47,7 +46,7 @@ class PolicyRun:
         except ValueError:
             raise
         except Exception as error:
-            raise ValueError(f"policy {name!r} raised {described(error)}") from error
+            raise ValueError(in_words(error, name)) from error
         self._observations, _ = env.reset(seed=seed)
         self._extremes = self.simulator.extremes
         self.episode_return = 0.0
@@ -112,10 +111,8 @@ class PolicyRun:
             return function(*arguments)
         except (FunnelError, SolveError):
             raise
-        except ValueError as error:
-            raise StoppedError(f"policy {self.name!r}: {error}") from error
         except Exception as error:
-            raise StoppedError(f"policy {self.name!r} raised {described(error)}") from error
+            raise StoppedError(in_words(error, self.name)) from error
 
 
 def policy_run(

@@ -127,7 +127,13 @@ class LawPolicy:
 
 
 class Reader:
-    """Builds a `View` from the concatenated observations of all agents."""
+    """Builds a `View` from the concatenated observations of all agents.
+
+    Slots without a `displacement`, of tasks that add none, have displacement zero: their agents are to meet.
+
+    Raises:
+        ValueError: for slots whose `displacement` hasn't as many columns as a position.
+    """
 
     def __init__(self, env: EnvDescription, fleet: Fleet) -> None:
         self._fleet, dim = fleet, fleet.position_dim
@@ -137,6 +143,7 @@ class Reader:
         valid: list[int] = []
         position: list[NDArray[np.int64]] = []
         wanted: list[NDArray[np.int64]] = []
+        displaced: list[int] = []  # edges whose slots have a displacement
         first = 0
         for i, (agent, layout) in enumerate(env.layouts.items()):
             for component, (name, unit) in enumerate(env.models[agent].states.items(), int(fleet.state_offset[i])):
@@ -147,15 +154,25 @@ class Reader:
                     self._value.append((component, first + layout.index(f"own.{name}")))
             for number, slot in enumerate(layout.slots):
                 if slot.task_edge:
+                    prefix = f"slot{number}.displacement"
+                    if prefix in layout.names or any(name.startswith(f"{prefix}.") for name in layout.names):
+                        columns = layout.columns(prefix)
+                        if len(columns) != dim:
+                            raise ValueError(
+                                f"laws read {prefix!r} as a displacement along each axis of the position, {dim} "
+                                f"columns; {agent!r} has {len(columns)}: add as many in slot_columns, or give them another name"
+                            )
+                        displaced.append(len(edges))
+                        wanted.append(first + columns)
                     edges.append((i, env.agents.index(slot.id) if slot.id in env.agents else -1))
                     valid.append(first + layout.index(f"slot{number}.valid"))
                     position.append(first + layout.columns(f"slot{number}.position"))
-                    wanted.append(first + layout.columns(f"slot{number}.displacement"))
             first += len(layout)
         self._edges = np.array(edges, np.int64).reshape(-1, 2)
         self._valid = np.array(valid, np.int64)
         self._position = np.array(position, np.int64).reshape(-1, dim)
         self._wanted = np.array(wanted, np.int64).reshape(-1, dim)
+        self._displaced = slice(None) if len(displaced) == len(edges) else np.array(displaced, np.int64)
 
     def view(self, flat: Float32Array, old: View | None) -> View:
         """The view from observations (B, columns); the memory of `old` is reused if its batch has the same size."""
@@ -173,6 +190,6 @@ class Reader:
         old.known[...] = valid.T
         displacement = old.displacement.transpose(1, 2, 0)
         displacement[...] = values[self._position]
-        displacement -= values[self._wanted]
+        displacement[self._displaced] -= values[self._wanted]
         displacement *= valid[:, None]
         return old

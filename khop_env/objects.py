@@ -119,7 +119,8 @@ def described(error: BaseException, file: str = "") -> str:
         error: the exception.
         file: end of a path; the innermost line in that file is named instead of the innermost of all.
     """
-    text = f"{type(error).__name__}: {error}"
+    said = error.args[0] if isinstance(error, KeyError) and " " in str(error) else error  # str() puts it in quotes
+    text = f"{type(error).__name__}: {said}"
     if isinstance(error, SyntaxError) and error.filename is not None:
         return f"{type(error).__name__}: {error.msg} ({_short(error.filename)}, line {error.lineno})"
     frames = traceback.extract_tb(error.__traceback__)

@@ -55,9 +55,48 @@ class Failing(MyPolicy):
         return found if self.count < 5 else 1 / 0
 
 
+class Unread(MyPolicy):
+    def act(self, observations):
+        self.layout.columns("slot0.positon")
+
+    def reset(self, env, seeds):
+        super().reset(env, seeds)
+        self.layout = env.layouts[env.agents[0]]
+
+
 class Misshapen(MyPolicy):
     def act(self, observations):
         return [0.0]
+"""
+MODELS_FILE = """
+import networkx as nx
+import numpy as np
+
+from khop_env.physics import SingleIntegrator
+from khop_env.observers import Exponential
+from khop_env.scenarios import Scenario
+
+
+class Rover(SingleIntegrator):
+    type = "rover"
+
+    def drift(self, t, x):
+        return %s
+
+
+
+def scenario():
+    return Scenario(
+        name="rovers",
+        description="",
+        models=(Rover(input_limit=1.0),) * 3,
+        communication=nx.path_graph(3),
+        task=nx.path_graph(3),
+        k=2,
+        delta=Exponential(1.0, 0.1, 2.0),
+        theta=Exponential(1.0, 1.0, 2.0),
+        radius=1.0,
+    ).sized()
 """
 TINY = ("--timesteps", "64", "--num-envs", "2", "--set", "n_steps=4", "--set", "batch_size=8", "--set", "evaluations=1")
 SHORT = {
@@ -319,3 +358,36 @@ def test_units_come_from_the_model(folder, monkeypatch):
     assert (units["slot0.position.x"], units["slot0.position.y"]) == ("rad", "m")
     assert (units["slot0.displacement.x"], units["slot0.displacement.y"]) == ("rad", "m")
     assert np.isfinite(env.reset(seed=0)[0]["integrator_0"]).all()
+
+
+@pytest.mark.parametrize("drift", ["np.stack([x[2], x[3]], axis=-1)", "np.stack([x[..., 0], x[..., 1]], axis=0)"])
+@pytest.mark.parametrize("command", ["check", "run", "iss"])
+def test_a_model_with_a_wrong_drift_is_refused_before_anything_runs(folder, monkeypatch, command, drift):
+    monkeypatch.delitem(sys.modules, "rovers", raising=False)
+    (folder / "rovers.py").write_text(MODELS_FILE % drift)
+    assert "Rover.drift(t, x) " in refused(command, "rovers.py:scenario", *SHORT[command])
+
+
+def test_a_model_that_stops_a_run_is_named_in_one_line(folder, monkeypatch):
+    monkeypatch.delitem(sys.modules, "rovers", raising=False)
+    (folder / "rovers.py").write_text(MODELS_FILE % "0.0 * x")
+    said = refused("run", "rovers.py:scenario", *SHORT["run"])
+    assert said.startswith("khop: no velocity controller for agents of type 'rover'")
+
+
+class TestAnErrorOfAPolicyNamesItAndItsLine:
+    WHY = "'drifter_0' has no field 'slot0.positon'; did you mean 'slot0.position'?"
+
+    @pytest.mark.parametrize("workers", ["1", "2"])
+    def test_in_a_comparison(self, folder, workers):
+        arguments = "--episodes", "1", "--observe", "local", "--env", "max_cycles=3", "--workers", workers
+        said = khop(
+            "evaluate", "consensus_v0", "--policies", "zero,my_file.py:Unread", *arguments, status=2
+        ).stderr.splitlines()[-1]
+        assert said.startswith(f"khop: policy 'my_file.py:Unread' raised KeyError: {self.WHY}")
+        assert ("(my_file.py, line " in said) == (workers == "1")  # a traceback doesn't come from other processes
+
+    def test_in_a_run(self, folder):
+        options = "--controller", "my_file.py:Unread", "--duration", "0.2"
+        said = khop("run", "consensus_v0", *options, status=2).stderr
+        assert f"khop: policy 'my_file.py:Unread' raised KeyError: {self.WHY} (my_file.py, line " in said

@@ -6,7 +6,7 @@ by relevance to its task: task edges first, then hop distance, then index.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -107,7 +107,7 @@ class ObservationLayout:
             KeyError: if there is no such field; the message suggests the closest name.
         """
         if name not in self._place:
-            raise KeyError(f"{self.agent!r} has no field {name!r}; {did_you_mean(name, self.names)}")
+            raise self._unknown(name, self.names)
         return self._place[name]
 
     def columns(self, prefix: str) -> NDArray[np.int64]:
@@ -117,7 +117,13 @@ class ObservationLayout:
             KeyError: if there is no such field; the message suggests the closest name.
         """
         found = [q for q, name in enumerate(self.names) if name == prefix or name.startswith(prefix + ".")]
-        return np.array(found or [self.index(prefix)], np.int64)
+        if not found:
+            ends = [(name, q) for name in self.names for q, letter in enumerate(name) if letter == "."]
+            raise self._unknown(prefix, dict.fromkeys([*(name[:q] for name, q in ends), *self.names]))
+        return np.array(found, np.int64)
+
+    def _unknown(self, name: str, known: Iterable[str]) -> KeyError:
+        return KeyError(f"{self.agent!r} has no field {name!r}; {did_you_mean(name, known)}")
 
     def read(self, observation: ArrayLike) -> dict[str, NDArray[np.float32]]:
         """Values by name from observations (..., D); each has shape (...), a number for a single observation.

@@ -140,7 +140,8 @@ class Task(abc.ABC):
         default_policy: name of the policy that acts if none is named; None for the law of the scenario.
         defaults: of arguments of the environment that aren't the task's own, where they differ from `env.Settings`.
         edges: (E, 2) directed pairs (i, j), sorted: agent i's task depends on agent j. Set by `bind`. Slots of
-            observations begin with these agents, laws act along these edges, and frames draw them.
+            observations begin with these agents, laws act along these edges (where slots have no `displacement`, to
+            meet), and frames draw them.
         memory: arrays that the next steps depend on, e.g. numbers drawn by `reset`; saved and restored with the state.
     """
 

@@ -247,6 +247,8 @@ def test_mistakes_name_the_nearest_field():
         KeyError, match=r"'integrator_0' has no field 'slot0.positon.x'; did you mean 'slot0.position.x'"
     ):
         layout.index("slot0.positon.x")
+    with pytest.raises(KeyError, match=r"has no field 'slot0.positon'; did you mean 'slot0.position'"):
+        layout.columns("slot0.positon")
     with pytest.raises(KeyError, match="has no field 'slot99'"):
         layout.columns("slot99")
     with pytest.raises(KeyError, match=r"has no field 'own.xx'; did you mean 'own\.x"):

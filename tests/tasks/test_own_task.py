@@ -11,9 +11,11 @@ from stable_baselines3 import PPO
 import khop_env
 from agents import evaluate, make_policy
 from agents.comparison import compare
+from agents.evaluation import play
 from agents.learning import TrainingConfig
 from agents.learning.training import train
 from khop_env.registry import make_aec, make_batched, make_joint
+from khop_env.tasks.base import directed
 from khop_env.testing import check_environment
 
 ROOT = Path(__file__).parents[2]
@@ -167,3 +169,49 @@ def test_mistakes_are_refused():
         make_batched(3)
     with pytest.raises(TypeError, match=r"got an unexpected keyword argument 'radios'; did you mean 'radius'"):
         make_batched(KeepApart, radios=1.0)
+
+
+class Meet(khop_env.Task):
+    """Edges of its own, from the task graph, and no columns in its slots."""
+
+    extra: tuple[str, ...] = ()
+
+    def bind(self, world):
+        super().bind(world)
+        self.edges = directed(world.graph)
+
+    def slot_columns(self, world, agent, other):
+        return [khop_env.Column(name, "m", -9.0, 9.0, 0.5) for name in self.extra]
+
+    def evaluate(self, world):
+        error = np.zeros((world.num_envs, len(world.fleet)))
+        return khop_env.Outcome(error, np.zeros(world.num_envs, bool), {"task_error": error})
+
+
+def effort(law, task):
+    env = make_batched(task, "paper", num_envs=2, max_cycles=20)
+    return play(env, make_policy(law), range(2)).effort
+
+
+# all parameters, since some are tuned for consensus
+@pytest.mark.parametrize(
+    "law", ["tanh:gain=2", "linear:gain=2", "formation:gain=2,speed=3", "leader_following:gain=3,shrink=0.9"]
+)
+def test_laws_take_a_displacement_that_the_slots_lack_as_zero(law):
+    np.testing.assert_array_equal(effort(law, Meet), effort(law, "consensus_v0"))
+    assert effort(law, Meet).all()
+
+
+def test_laws_take_a_displacement_that_the_slots_have():
+    class Apart(Meet):
+        extra = ("displacement.x", "displacement.y")
+
+    assert (effort("linear:gain=2", Apart) != effort("linear:gain=2", Meet)).all()
+
+
+def test_a_displacement_of_another_size_is_refused():
+    class Odd(Meet):
+        extra = ("displacement.x",)
+
+    with pytest.raises(ValueError, match=r"'slot0.displacement' .* 2 columns; 'drifter_0' has 1: add as many"):
+        effort("tanh", Odd)
