@@ -160,7 +160,7 @@ class Reader:
                         if len(columns) != dim:
                             raise ValueError(
                                 f"laws read {prefix!r} as a displacement along each axis of the position, {dim} "
-                                f"columns; {agent!r} has {len(columns)}: add as many in slot_columns, or give them another name"
+                                f"columns; {agent!r} has {len(columns)}: add as many in slot_columns, or rename them"
                             )
                         displaced.append(len(edges))
                         wanted.append(first + columns)

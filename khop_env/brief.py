@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+
+BOUND_REACHED = 1e-6
+"""Rounding by which an error may exceed its certified bound, which it may reach, and still be written as 1.000."""
 
 _LONGEST = 60  # characters of a value that is shown as it is
 
@@ -33,6 +37,25 @@ def spread(t: NDArray[np.float64]) -> str:
     """
     first, last = f"{t.min():.6g}", f"{t.max():.6g}"
     return f"t = {first} s" if first == last else f"t = {first} to {last} s"
+
+
+def ratio_text(value: float | None, rounding: float = 0.0) -> str:
+    """A ratio to a bound with three decimals, which never say 1.000 of another number.
+
+    Below 1 it is rounded down to "0.999+"; above 1 it has as many decimals as tell it from 1.
+
+    Args:
+        value: the ratio; None if it isn't finite.
+        rounding: by how much the ratio may exceed 1 and be written as 1.000, for bounds that may be reached.
+    """
+    if value is None or not math.isfinite(value):
+        return "not finite"
+    if value >= 1e4:
+        return f"{value:.4g}"
+    text = f"{value:.3f}"
+    if text != "1.000" or 1.0 <= value <= 1.0 + rounding:
+        return text
+    return "0.999+" if value < 1.0 else next((t for d in range(4, 17) if float(t := f"{value:.{d}f}") != 1.0), text)
 
 
 def _short(value: Any) -> str:

@@ -14,9 +14,13 @@ from typing import Any
 
 import typer
 
+from khop_env.brief import BOUND_REACHED, ratio_text
+
 SHOWN_TARGETS = 20
 _SHOWN_IDS = 6  # of a k-hop set
 _PAGE = 80  # columns
+_NEARLY = 0.99  # of a certified bound: from here on a sentence says that this is normal
+NEARLY_REACHED = "close to 1 is normal over a network: an agent that drives at its limit reaches its bound"
 _LONGEST_NAME = 18  # characters in a table; longer ones are folded
 
 _UNSURE = 0.5  # s of work before it is guessed how long it will take
@@ -182,12 +186,15 @@ def _print_certified(summary: Mapping[str, Any]) -> None:
     age = summary["mean_age"]
     known = "nothing arrived" if age is None else f"states that agents know are {1e3 * age:.4g} ms old on average"
     print_text(f"network: {summary['network']}; {known}")
-    ratio = f"largest |error| / certified bound {_ratio(summary['max_error_to_bound'])}"
+    largest = ratio_text(summary["max_error_to_bound"], BOUND_REACHED if summary["bounds_kept"] else 0.0)
+    ratio = f"largest |error| / certified bound {largest}"
     if summary["max_normalized_disagreement"] is not None:
-        ratio += f"; |xi|/rho of what agents hold {_ratio(summary['max_normalized_disagreement'])}"
+        ratio += f"; |xi|/rho of what agents hold {ratio_text(summary['max_normalized_disagreement'])}"
     kept = "kept" if summary["bounds_kept"] else "not kept"
     violated = f"{summary['violations']} violations in {summary['pair_samples']} pairs and samples"
     print_text(f"certified bounds {kept}: {ratio}; {violated}")
+    if summary["bounds_kept"] and (summary["max_error_to_bound"] or 0.0) > _NEARLY:
+        print_text(f"({NEARLY_REACHED})")
     for agent, reason in itertools.islice(summary["uncertified"].items(), _SHOWN_IDS):
         print_text(f"{agent}: {reason}")
     if summary["error"] is not None or summary.get("terminated"):
@@ -197,11 +204,11 @@ def _print_certified(summary: Mapping[str, Any]) -> None:
 
 def _print_guarantee(summary: Mapping[str, Any]) -> None:
     """What became of the funnels."""
-    ratios = f"|xi|/rho {_ratio(summary['max_normalized_disagreement'])}, "
-    ratios += f"|x_tilde|/bound {_ratio(summary['max_error_to_bound'])}"
+    ratios = f"|xi|/rho {ratio_text(summary['max_normalized_disagreement'])}, "
+    ratios += f"|x_tilde|/bound {ratio_text(summary['max_error_to_bound'])}"
     if summary["max_error_to_bound_input"] is not None:
-        ratios += f"; of the inputs |mu|/omega {_ratio(summary['max_normalized_disagreement_input'])}, "
-        ratios += f"|g_tilde|/bound {_ratio(summary['max_error_to_bound_input'])}"
+        ratios += f"; of the inputs |mu|/omega {ratio_text(summary['max_normalized_disagreement_input'])}, "
+        ratios += f"|g_tilde|/bound {ratio_text(summary['max_error_to_bound_input'])}"
     if summary["funnel_kept"]:
         print_text(f"guarantee kept: largest {ratios} (all below 1)")
         if cut_off := summary.get("cut_off"):
@@ -255,15 +262,6 @@ def _print_outcomes(found: Mapping[str, float | None]) -> None:
 
 def _number(value: float | None, unit: str = "") -> str:
     return "not finite" if value is None else f"{value:.4g} {unit}".strip()
-
-
-def _ratio(value: float | None) -> str:
-    """Three decimals, or as many as tell it from 1."""
-    if value is None:
-        return "not finite"
-    if value >= 1e4:
-        return f"{value:.4g}"
-    return next((text for d in range(3, 17) if float(text := f"{value:.{d}f}") != 1.0), "1.000")
 
 
 def print_design(report: Mapping[str, Any]) -> None:
@@ -337,7 +335,7 @@ def _funnel_rows(target: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
                 _span(group[bound]),
                 _span(group[funnel]),
                 "" if group[funnel]["rate"] is None else f"{group[funnel]['rate']:g}",
-                "at reset" if share is None else f"{_ratio(share)}{'' if share < 1.0 else ': no'}",
+                "at reset" if share is None else f"{ratio_text(share)}{'' if share < 1.0 else ': no'}",
             )
             who = ""
 
@@ -349,7 +347,7 @@ def _span(function: Mapping[str, float | None]) -> str:
 def _all_targets(targets: Sequence[Mapping[str, Any]]) -> str:
     etas = [target["eta"] for target in targets]
     shares = [group["start_share"] for target in targets for kind in ("state", "input") for group in target[kind]]
-    worst = _ratio(max((share for share in shares if share is not None), default=0.0))
+    worst = ratio_text(max((share for share in shares if share is not None), default=0.0))
     worst += " (where |g| is bounded)" if None in shares else ""
     return (
         f"... and {len(targets) - SHOWN_TARGETS} more (--json has all). Over all {len(targets)}: eta {min(etas)} to "

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from khop_env import terminal
+from khop_env.brief import BOUND_REACHED, ratio_text
 
 
 class TestProgress:
@@ -38,16 +39,33 @@ class TestProgress:
     ("value", "expected"),
     [
         (0.5, "0.500"),
-        (0.9999998, "0.9999998"),
+        (0.9999998, "0.999+"),
+        (0.9994, "0.999"),
+        (1.0 + 1e-9, "1.000000001"),
         (1.00004, "1.00004"),
         (1.0, "1.000"),
-        (0.99951, "0.9995"),
+        (0.99951, "0.999+"),
         (2.5e7, "2.5e+07"),
         (None, "not finite"),
     ],
 )
 def test_a_ratio_is_never_rounded_to_1(value, expected):
-    assert terminal._ratio(value) == expected
+    assert ratio_text(value) == expected
+
+
+def test_an_error_that_reaches_its_certified_bound_is_no_violation():
+    assert ratio_text(1.0 + 1e-9, BOUND_REACHED) == "1.000"
+    assert ratio_text(1.0 + 1e-5, BOUND_REACHED) == "1.00001"
+
+
+@pytest.mark.parametrize(("value", "explained"), [(1.0 - 1e-9, True), (0.7, False)])
+def test_a_ratio_close_to_1_over_a_network_is_explained(value, explained, capsys):
+    summary = {"mean_age": 0.1, "network": "wifi", "max_error_to_bound": value, "max_normalized_disagreement": None}
+    summary |= {"bounds_kept": True, "violations": 0, "pair_samples": 9, "uncertified": {}, "error": None}
+    terminal._print_certified(summary)
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("certified bound 0.999+;" in said) == explained
+    assert ("close to 1 is normal over a network" in said) == explained
 
 
 @given(st.data(), st.integers(20, 120))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from khop_env.brief import BOUND_REACHED, ratio_text
 from khop_env.commands.common import networked
 from khop_env.commands.episodes import Episode
 from khop_env.terminal import print_text, say
@@ -250,7 +251,7 @@ def _table(fraction: float, supervisor: Supervisor, live: Any, scenario: Scenari
             "" if math.isnan(each.period_kept) else f"{100.0 * each.period_kept:.1f} %",
             *messages,
             str(sum(counts.get("refused", {}).values())),
-            "" if math.isnan(each.ratio) else f"{each.ratio:.3f}",
+            "" if math.isnan(each.ratio) else ratio_text(each.ratio, BOUND_REACHED),
             "nothing yet" if math.isinf(each.age) else f"{each.age:.3f}",
         )
     return table

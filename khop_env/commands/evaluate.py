@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from khop_env.brief import BOUND_REACHED, ratio_text
 from khop_env.commands.common import (
     INTERRUPTED,
     EnvironmentArgument,
@@ -25,7 +26,7 @@ from khop_env.commands.common import (
     shielded_name,
     with_network,
 )
-from khop_env.terminal import Progress, folded, print_table, print_text, say, waiting
+from khop_env.terminal import NEARLY_REACHED, Progress, folded, print_table, print_text, say, waiting
 
 if TYPE_CHECKING:
     from agents.comparison import Comparison, Row
@@ -214,8 +215,11 @@ def print_comparison(comparison: Comparison) -> None:
     if networked:
         where += f" over a network ({comparison.network}), estimator {comparison.estimator}"
     title = f"{where}, {comparison.planned} episodes, the same for every row"
+    guarantee = "bound (of all observers, below 1 by guarantee)"
+    if networked:
+        guarantee = f"certified bound (at most 1 by guarantee; {NEARLY_REACHED})"
     if comparison.rows[0].episodes.outcomes:
-        _print_outcomes(comparison, title)
+        _print_outcomes(comparison, title, guarantee)
         return
     rows: list[tuple[str, ...]] = []
     for row, heading in _by_network(comparison):
@@ -233,17 +237,14 @@ def print_comparison(comparison: Comparison) -> None:
                 f"{seen['final_task_error']:.3g}",
                 "never" if settling is None else f"{settling:.3g}",
                 f"{seen['effort']:.3g}",
-                *[f"{seen['max_normalized_disagreement']:.3f}"] * (not no_disagreement),
-                f"{seen['max_error_to_bound']:.3f}",
+                *[ratio_text(seen["max_normalized_disagreement"])] * (not no_disagreement),
+                ratio_text(seen["max_error_to_bound"], BOUND_REACHED if networked else 0.0),
             )
         )
     unit = comparison.rows[0].env.error_unit
     ratios = ("e / bound",) if no_disagreement else ("|e|", "e / bound")
     header = ("policy", "return", "to first row", f"task error ({unit})", "settled (s)", "effort", *ratios)
     disagreement = "|e|: largest |xi| / rho" + (" of what agents hold" if networked else "")
-    guarantee = "bound (of all observers, below 1 by guarantee)"
-    if networked:
-        guarantee = "certified bound (at most 1 by guarantee)"
     print_table(header, rows, title)
     print_text(
         "return: mean over agents of an episode's sum, 95 % intervals; to first row: paired differences; task error: "
@@ -253,9 +254,10 @@ def print_comparison(comparison: Comparison) -> None:
     )
 
 
-def _print_outcomes(comparison: Comparison, title: str) -> None:
+def _print_outcomes(comparison: Comparison, title: str, guarantee: str) -> None:
     """The table of an environment in which agents may collide."""
     rows: list[tuple[str, ...]] = []
+    networked = comparison.network is not None
     began_anew = any(row.summary()["infeasible"] for row in comparison.rows)
     for row, heading in _by_network(comparison):
         rows += heading
@@ -270,7 +272,7 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
                 _mean(seen, "intervention", ".3f"),
                 *["" if filtered is None else f"{100.0 * seen['infeasible']:.2g}"] * began_anew,
                 f"{seen['mean_return']:.2f}" + ("" if seen["ci95"] is None else f"\n±{seen['ci95']:.2f}"),
-                f"{seen['max_error_to_bound']:.3f}",
+                ratio_text(seen["max_error_to_bound"], BOUND_REACHED if networked else 0.0),
             )
         )
     header = ("policy", "collided %", "success %", "deadlock %", "time (s)", "distance (m)", "changed (m/s)")
@@ -286,7 +288,7 @@ def _print_outcomes(comparison: Comparison, title: str) -> None:
         "episodes; distance: smallest of two agents' centres; changed: by a filter or barrier, of each agent's inputs, "
         "mean over time; "
         f"{infeasible if began_anew else ''}return: mean over agents of an episode's sum; e / bound: "
-        "largest estimation error over its bound (below 1 by guarantee)"
+        f"largest estimation error over its {guarantee}"
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from khop_env.brief import ratio_text
 from khop_env.observers import FloatArray
 from khop_env.physics import hops_from_targets
 from khop_env.results.metrics import ROUNDING
@@ -97,7 +98,9 @@ def _headline(recording: Recording, scenario: Scenario) -> str:
     if isinstance(recording.states, MessageRecord) and recording.error is None:
         largest, pairs = float(extremes.relative[0]), recording.states.layout.pairs
         kept = "inside all certified boxes" if largest <= 1.0 + ROUNDING else "a certified box was left"
-        return f"{scenario.name}: {kept}; largest |error| / bound = {_digits(largest)} over all {pairs} pairs"
+        return (
+            f"{scenario.name}: {kept}; largest |error| / bound = {ratio_text(largest, ROUNDING)} over all {pairs} pairs"
+        )
     ratios = float(np.maximum(extremes.normalized, extremes.input_normalized)[0])  # nan if any is
     over = f"over all {recording.states.layout.pairs} pairs"
     if isinstance(recording.states, ObserverRecord) and recording.states.cut_off.any():
@@ -105,11 +108,7 @@ def _headline(recording: Recording, scenario: Scenario) -> str:
     if recording.error is not None:
         return f"{scenario.name}: stopped at t = {recording.time[-1]:.4g} s, {_reason(recording)}"
     kept = "inside all funnels" if ratios < 1.0 else "funnels left"
-    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {_digits(ratios)} {over}"
-
-
-def _digits(ratio: float) -> str:
-    return f"{ratio:.3f}" if round(ratio, 3) != 1.0 else f"{ratio:.12g}"  # never 1.000 for another number
+    return f"{scenario.name}: {kept}; largest |disagreement| / funnel = {ratio_text(ratios)} {over}"
 
 
 def _reason(recording: Recording) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from khop_env.brief import BOUND_REACHED, ratio_text
 from khop_env.env.rendering.canvas import Canvas, Rect
 from khop_env.env.rendering.links import DOWN, FRESH, draw_link, faded
 from khop_env.env.rendering.looks import (
@@ -26,7 +27,6 @@ from khop_env.env.rendering.scene import Scene
 from khop_env.observers import FloatArray
 
 _GAUGE_END = 1.25  # the largest ratio that the gauge has room for
-_ROUNDING = 1.0 + 1e-6  # of errors over certified bounds, which they may reach
 _MOST_TYPES, _MOST_TYPES_WITH_LINKS = 9, 5  # that the legend has room for
 _STAR = np.array(
     [[r * math.sin(a), r * math.cos(a)] for a, r in zip(np.arange(10) * math.pi / 5, [1, 0.45] * 5, strict=True)]
@@ -142,10 +142,8 @@ class Panel:
     def _draw_gauge(self, canvas: Canvas, scene: Scene) -> None:
         """A bar up to the largest ratio; it has to end before the mark at 1, or at it if it is of a certified bound."""
         unit, ratio, certified = self._unit, scene.ratio, scene.messages is not None
-        kept = ratio <= _ROUNDING if certified else ratio < 1.0
-        value = "not finite" if not math.isfinite(ratio) else f"{ratio:.3f}"
-        if kept and value == "1.000" and not certified:
-            value = "0.999…"
+        kept = ratio <= 1.0 + BOUND_REACHED if certified else ratio < 1.0
+        value = ratio_text(ratio, BOUND_REACHED if certified else 0.0)
         label = "largest error/bound" if certified else "largest |e|"
         self._write(canvas, f"{label}  {value}", color=INK if kept else ALARM_COLOR, advance=20)
         left, height = self._left, 12 * unit
