@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from khop_env import __version__
 from khop_env.commands.bench import bench
@@ -31,8 +32,29 @@ from khop_env.commands.tune import tune
 from khop_env.own_agents import AGENTS, claim_agents
 from khop_env.terminal import say
 
+
+class _Flags:
+    """Shows flags in --help without a type, as they take no value."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        found: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for parameter in found:
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
+        return found
+
+
+class _Command(_Flags, TyperCommand):
+    """A command."""
+
+
+class _Group(_Flags, TyperGroup):
+    """All commands."""
+
+
 app = typer.Typer(
     name="khop",
+    cls=_Group,
     help="Decentralised k-hop prescribed performance observers: the paper's experiment and yours.",
     no_args_is_help=True,
     add_completion=False,
@@ -61,7 +83,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "bench": bench,
 }
 for name, command in COMMANDS.items():
-    app.command(name, help=_help(command))(command)
+    app.command(name, cls=_Command, help=_help(command))(command)
 
 
 def main() -> None:

@@ -448,6 +448,14 @@ def test_help_is_folded_between_words(command, monkeypatch):
     assert " ".join(COMMANDS[command].__doc__.split()) in paragraphs
 
 
+@pytest.mark.parametrize("command", [(), *((name,) for name in sorted(COMMANDS))])
+def test_help_shows_flags_without_a_value(command):
+    """As `--bounds true` isn't understood."""
+    found = khop(*command, "--help").stdout
+    assert "--help" in found
+    assert "bool" not in found.lower()
+
+
 def test_help_names_every_command():
     found = khop("--help").stdout
     for command in ("list", "check", "run", "export", "bench"):
@@ -460,3 +468,20 @@ def test_as_a_module_in_a_process_of_its_own(tmp_path):
     found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert json.loads(found.stdout)["funnel_kept"] is True
     assert (tmp_path / "runs" / "paper-tanh-estimate-seed0" / "figure.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "inside"),
+    [
+        (("run", "paper"), "khop_env.results.record"),
+        (("check", "paper"), "khop_env.results.design_report"),
+        (("test", "consensus_v0"), "khop_env.testing.check_environment"),
+        (("evaluate", "consensus_v0"), "agents.comparison.compare"),
+    ],
+)
+def test_status_after_ctrl_c_where_there_are_no_results(folder, monkeypatch, command, inside):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(inside, interrupt)
+    khop(*command, status=130)

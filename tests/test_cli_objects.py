@@ -391,3 +391,18 @@ class TestAnErrorOfAPolicyNamesItAndItsLine:
         options = "--controller", "my_file.py:Unread", "--duration", "0.2"
         said = khop("run", "consensus_v0", *options, status=2).stderr
         assert f"khop: policy 'my_file.py:Unread' raised KeyError: {self.WHY} (my_file.py, line " in said
+
+
+def test_what_is_played_by_default_on_a_task_without_edges(folder, monkeypatch):
+    monkeypatch.delitem(sys.modules, "free", raising=False)
+    (folder / "free.py").write_text(
+        "import numpy as np\nfrom khop_env import Outcome, Task\n\n\nclass Free(Task):\n"
+        "    def evaluate(self, world):\n        error = np.zeros((world.num_envs, len(world.fleet)))\n"
+        "        return Outcome(error, np.zeros(world.num_envs, bool), {'task_error': error})\n"
+    )
+    options = "--episodes", "1", "--observe", "local", "--env", "max_cycles=3", "--json"
+    result = khop("evaluate", "free.py:Free", *options)
+    assert [row["policy"] for row in only_json(result)["rows"]] == ["zero", "random"]
+    assert "khop: free_v0 has no task edges, along which laws act: zero and random play" in result.stderr
+    found = only_json(khop("evaluate", "my_file.py:MyTask", *options))["rows"]
+    assert [row["policy"] for row in found] == ["tanh", "linear", "zero", "random"]

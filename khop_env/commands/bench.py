@@ -9,11 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
-from khop_env.commands.common import JsonOption, mistakes, print_json
+from khop_env.commands.common import INTERRUPTED, JsonOption, mistakes, print_json
 from khop_env.terminal import print_table, print_text, say
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 
 
 def bench(

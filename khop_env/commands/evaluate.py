@@ -30,6 +30,8 @@ from khop_env.terminal import NEARLY_REACHED, Progress, folded, print_table, pri
 
 if TYPE_CHECKING:
     from agents.comparison import Comparison, Row
+    from khop_env.scenarios import Scenario
+    from khop_env.tasks import Task
 
 
 def evaluate(
@@ -41,8 +43,8 @@ def evaluate(
             help="Laws (tanh, linear, formation, leader_following), with parameters after a colon: "
             "linear:gain=2,cancel_drift=true; zero, random, bang_bang; learned ones, ppo:FOLDER or ppo:pretrained; "
             "go_to_goal, keep_right, orca and robust_barrier in navigation_v0; classes of your own, "
-            "my_file.py:MyPolicy; any of them in a safety filter, filter:tanh. By default tanh, linear, zero and "
-            "random, or go_to_goal, zero and random."
+            "my_file.py:MyPolicy; any of them in a safety filter, filter:tanh. By default tanh, linear (where "
+            "a task has edges) or go_to_goal, zero and random."
         ),
     ] = None,
     observe: Annotated[
@@ -105,12 +107,14 @@ def evaluate(
             raise ValueError("--csv and --json: choose one of them")
         require_figure(figure)
         task = find_task(environment)
-        default = f"{task.default_policy or 'tanh,linear'},zero,random"
         arguments = environment_arguments(env, task, {"observe": "--observe"})
         networks = [] if network is None else split_specs(network, "--network", "network")
         single = with_network(arguments, network, estimator)  # refuses two choices
         arguments = single if len(networks) < 2 else with_network(arguments, None, estimator)
         chosen = None if scenario is None else load(scenario)
+        default = f"{task.default_policy or 'tanh,linear'},zero,random"
+        if policies is None and not _laws_act(task, chosen, arguments):
+            default = "zero,random"
         names = [shielded_name(policy, shield) for policy in split_specs(policies or default, "--policies", "policy")]
         if observe is None:
             bounded = any(needs(make_policy(name)).bounds for name in names)
@@ -168,6 +172,19 @@ def evaluate(
         why, status = unfinished
         say(f"khop: {why}; {'above are the episodes that were' if comparison.rows else 'none was'} played until then")
         raise typer.Exit(status)
+
+
+def _laws_act(task: Task | type[Task], scenario: Scenario | None, arguments: Mapping[str, Any]) -> bool:
+    """Whether a task has a policy of its own, or edges along which laws act; if not, say what is played instead."""
+    from khop_env.registry import environments, make_batched
+
+    name = f"{task.name}_v{task.version}"
+    if task.default_policy is not None or name in environments():
+        return True
+    if len(make_batched(task, scenario, **arguments).task.edges):
+        return True
+    say(f"khop: {name} has no task edges, along which laws act: zero and random play; choose others by --policies")
+    return False
 
 
 def _command(environment: str, options: Mapping[str, object], env: Sequence[str]) -> str:

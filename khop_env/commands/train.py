@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from khop_env.commands.common import (
+    INTERRUPTED,
     EnvironmentScenario,
     EnvOption,
     EstimatorOption,
@@ -117,9 +118,9 @@ def train(
     Settings that aren't chosen have defaults, of their own for navigation_v0 and for SAC; config.toml in the folder has
     them all. A policy trained with --shield is played inside the filter: filter:ppo:FOLDER, as the last line says.
 
-    Ctrl-C saves the policy and ends. --resume continues from the last of twenty checkpoints as if nothing had happened;
-    SAC begins with an empty replay buffer. With larger --timesteps a finished run continues; if its scenario was edited
-    since, it is refused.
+    Ctrl-C saves the policy and ends, with exit status 130. --resume continues from the last of twenty checkpoints as if
+    nothing had happened; SAC begins with an empty replay buffer. With larger --timesteps a finished run continues; if
+    its scenario was edited since, it is refused.
     """
     options = {
         "environment": environment,
@@ -178,6 +179,8 @@ def train(
         for name, path in files.items():
             typer.echo(f"{name}: {path}")
         typer.echo(f"play it: {_play(chosen, folder)}")
+    if not training.finished:
+        raise typer.Exit(INTERRUPTED)
 
 
 def _chosen(
