@@ -88,8 +88,12 @@ def _text_of(path: str) -> bytes:
 
 @functools.cache
 def _announce(kept: bool) -> None:
-    where = "the result is kept for later runs" if kept else "no folder can be written, so every process does it"
-    _say(f"compiling for this machine, about ten seconds in all ({where}) ...")
+    where = (
+        "some seconds; the result is kept for later runs"
+        if kept
+        else "some seconds, in every process, since no folder can be written"
+    )
+    _say(f"compiling what is used for the first time on this machine ({where}) ...")
 
 
 @functools.cache

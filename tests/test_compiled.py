@@ -50,7 +50,8 @@ def entry(folder: Path) -> Path:
 def test_a_kernel_is_compiled_once(folder, capsys):
     assert not found()
     assert capsys.readouterr().err == (
-        "khop_env: compiling for this machine, about ten seconds in all (the result is kept for later runs) ...\n"
+        "khop_env: compiling what is used for the first time on this machine (some seconds; the result is kept for later "
+        "runs) ...\n"
     )
     assert found()
     compiled(kernel).recompile()
@@ -126,8 +127,8 @@ def test_without_any_folder_kernels_still_compile(capsys):
     assert compiled(namespace["kernel"])(1.0) == 2.0
     assert compiled(namespace["kernel"])(1) == 2.0
     assert capsys.readouterr().err == (
-        "khop_env: compiling for this machine, about ten seconds in all (no folder can be written, so every process "
-        "does it) ...\n"
+        "khop_env: compiling what is used for the first time on this machine (some seconds, in every process, since no "
+        "folder can be written) ...\n"
     )
 
 

@@ -18,7 +18,7 @@ from khop_env.env.layout import Float32Array, ObservationLayout
 from khop_env.env.options import initial_states
 from khop_env.env.state import EnvState, Infos
 from khop_env.observers import FloatArray, IntArray
-from khop_env.physics import did_you_mean
+from khop_env.physics import did_you_mean, or_did_you_mean
 
 if TYPE_CHECKING:
     from khop_env.env.rendering import Renderer
@@ -54,8 +54,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             )
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(
-                f"render_mode must be None, 'human' or 'rgb_array'; got {render_mode!r}; "
-                f"{did_you_mean(str(render_mode), RENDER_MODES)}"
+                f"render_mode must be None, 'human' or 'rgb_array'; got {render_mode!r}"
+                f"{or_did_you_mean(render_mode, RENDER_MODES)}"
             )
         self.metadata = {
             "name": name,
@@ -202,11 +202,16 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             )
         if not self.agents:
             raise ValueError("no episode is running: it is over, or none has begun; call reset() first")
+        if actions.keys() != self._entries.keys():
+            for agent in actions:  # a wrong name explains the missing ones
+                self._known(agent)
         flat = self._actions[0]
         for agent, part in self._entries.items():
             if agent not in actions:
                 missing = [known for known in self.agents if known not in actions]
-                raise ValueError(f"actions are missing for {len(missing)} agents: {', '.join(missing[:8])}")
+                raise ValueError(
+                    f"actions are missing for {len(missing)} agent{'s' * (len(missing) > 1)}: {', '.join(missing[:8])}"
+                )
             try:
                 action = np.asarray(actions[agent], dtype=np.float64)
             except (TypeError, ValueError):
@@ -216,9 +221,6 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
                     f"the action of {agent!r} must have shape ({part.stop - part.start},); got {action.shape}"
                 )
             flat[part] = action
-        if len(actions) != len(self._entries):
-            for agent in actions:
-                self._known(agent)
         return self._actions
 
     def _by_agent(self, observations: Float32Array) -> dict[str, Float32Array]:

@@ -12,7 +12,7 @@ from khop_env.env.actuators import Actuator, Direct, Hold, as_actuator
 from khop_env.network import NO_NETWORK, Network
 from khop_env.observers import Estimator, as_estimator
 from khop_env.observers.proximal import MOST_THREADS
-from khop_env.physics import did_you_mean
+from khop_env.physics import or_did_you_mean
 from khop_env.simulation import OBSERVE, Observe
 
 MOST_DATA = 1000  # numbers of a policy in a message
@@ -67,8 +67,8 @@ class Settings:
     def __post_init__(self) -> None:
         if self.observe not in OBSERVE:
             raise ValueError(
-                f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}; "
-                f"{did_you_mean(str(self.observe), OBSERVE)}"
+                f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}"
+                f"{or_did_you_mean(self.observe, OBSERVE)}"
             )
         for name in ("bounds", "uniform"):
             if not isinstance(getattr(self, name), bool):

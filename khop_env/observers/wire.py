@@ -29,7 +29,7 @@ import numpy as np
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.fingerprint import fingerprint
 from khop_env.observers.layout import FloatArray
-from khop_env.physics import did_you_mean
+from khop_env.physics import or_did_you_mean
 
 EstimatorName = Literal["ppso", "relay"]
 """The paper's observers by rounds of messages, or states that are relayed and predicted."""
@@ -314,7 +314,7 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
         ValueError: with the nearest choice.
     """
     if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}, {did_you_mean(value, choices)}")
+        raise ValueError(f"{name} must be one of {', '.join(choices)}; got {value!r}{or_did_you_mean(value, choices)}")
 
 
 def _check(design: ObserverDesign, who: str, what: str, values: Mapping[int, FloatArray | None]) -> None:

@@ -4,7 +4,7 @@ Agent models f_i and g_i, disturbances w_i, the fleet that joins them into flat 
 which agents communicate. Right-hand sides are pure functions of (t, x, u); random numbers are drawn once per episode.
 """
 
-from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean, read_only
+from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean, or_did_you_mean, read_only
 from khop_env.physics.disturbance import AttachedDisturbance, Channels, Disturbance, Sum, Term
 from khop_env.physics.disturbances import DISTURBANCES, BandLimitedNoise, Coupling, Gust, Sinusoid
 from khop_env.physics.fleet import Fleet, Group
@@ -58,6 +58,7 @@ __all__ = [
     "Unicycle",
     "check_task_graph",
     "did_you_mean",
+    "or_did_you_mean",
     "drifting_integrator_drift",
     "hop_distances",
     "hops_from_targets",

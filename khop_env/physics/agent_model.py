@@ -37,6 +37,12 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f"known: {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}"
 
 
+def or_did_you_mean(name: object, known: Iterable[str]) -> str:
+    """ "; did you mean 'x'?" after a list of all known names, which needn't be repeated; or nothing."""
+    nearest = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"; did you mean {nearest[0]!r}?" if nearest else ""
+
+
 def read_only(view: Array) -> Array:
     """The view itself, which can't be written through any more."""
     view.flags.writeable = False

@@ -36,6 +36,7 @@ AUTO = "auto"
 """Value of `initial` for a bound that is sized from the initial set, by `Scenario.sized`."""
 
 _LARGEST_FILE = 2**26  # bytes
+_EXPONENTIAL = {"initial", "final", "rate"}
 _ABSENT: Any = object()
 _Made = TypeVar("_Made")
 _Edge = tuple[int, int]
@@ -103,7 +104,11 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
     if "arena" in root.names():
         with root.gathering():
             values["arena"] = read_arena(root.table("arena"))
-    if "models" not in values:  # nothing below can be read without models
+    if "models" not in values:  # most of what is below can't be read without models
+        for table in (tables["delta"], theta):
+            if table is not None and set(table.names()) & _EXPONENTIAL:  # one for all agents
+                with root.gathering():
+                    _exponentials(table, None, set())
         with root.gathering():
             root.finish()
         root.raise_mistakes()
@@ -277,7 +282,7 @@ def _graph(
 def _bounds(table: CheckedTable, types: dict[str, int], complete: bool, auto: set[tuple[str, str | None]]) -> Bounds:
     """One exponential for all agents, or a bound for each type of agent; `auto` gets those to be sized."""
     if not any(key in types for key in table.names()):
-        if not set(table.names()) & {"initial", "final", "rate"}:
+        if not set(table.names()) & _EXPONENTIAL:
             for key in table.names():
                 table.refuse(key, f"unknown key; {did_you_mean(key, ['initial', 'final', 'rate', *types])}")
         return _exponentials(table, None, auto)  # type: ignore[return-value]

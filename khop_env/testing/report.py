@@ -31,7 +31,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Report:
-    """Results of all checks of an environment; `str` gives a table of 80 columns.
+    """Results of all checks of an environment; `str` gives a table of 80 columns, failures last.
 
     Attributes:
         environment: name of the environment.
@@ -54,7 +54,7 @@ class Report:
         counts = ", ".join(f"{statuses.count(status)} {status}" for status in ("passed", "failed", "skipped"))
         names = max((len(check.name) for check in self.checks), default=0)
         lines = textwrap.wrap(f"{self.environment}: {counts}", _WIDTH)
-        for check in self.checks:
+        for check in sorted(self.checks, key=lambda check: check.status == "failed"):  # where they are seen
             status = check.status.upper() if check.status == "failed" else check.status
             head = f"{status:<8} {check.name:<{names}}  "
             for start, text in ((head, check.claim), (" " * (len(head) + 2), check.detail)):

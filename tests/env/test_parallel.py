@@ -27,9 +27,10 @@ def without(env, *agents):
 
 # convoy: the leaders are drifter_0, drifter_3 and drifter_6
 BAD_ACTIONS = {
-    "missing": (lambda e: without(e, "drifter_2"), "actions are missing for 1 agents: drifter_2"),
+    "missing": (lambda e: without(e, "drifter_2"), "actions are missing for 1 agent: drifter_2"),
     "missing two": (lambda e: without(e, "drifter_2", "drifter_4"), "missing for 2 agents: drifter_2, drifter_4"),
     "none": (lambda e: {}, "actions are missing for 5 agents: drifter_1, drifter_2, drifter_4"),
+    "unknown only": (lambda e: {"agent_0": np.zeros(2)}, "no agent 'agent_0'; known: drifter_1, drifter_2"),
     "unknown": (lambda e: with_action(e, "drifter_11", np.zeros(2)), "no agent 'drifter_11'; did you mean 'drifter_1'"),
     "leader": (lambda e: with_action(e, "drifter_3", np.zeros(2)), "no agent 'drifter_3'; it is a leader"),
     "long": (
@@ -211,7 +212,7 @@ WRONG_SETTINGS = {
     "order": (3, "exists at order 1 and 2; got order=3"),
     "threads": (0, "threads must be"),
     "actuator": ("lagg", r"no actuator 'lagg'; did you mean 'lag'.*Lag\(time_constant=0.2\)"),
-    "render_mode": ("rgb", "render_mode must be None, 'human' or 'rgb_array'; got 'rgb'; known: human, rgb_array"),
+    "render_mode": ("rgb", "render_mode must be None, 'human' or 'rgb_array'; got 'rgb'$"),
     "scenario": ("convoi", "no scenario 'convoi'; did you mean 'convoy'"),
 }
 

@@ -265,11 +265,13 @@ def test_all_mistakes_of_a_file_are_named_at_once(tmp_path):
         MINIMAL.replace("k = 2", "k = 1\nduraton = 3")
         .replace("count = 3", "count = 0\ndim = 7.5\ncolour = 1")
         .replace("final = 0.1", "final = -0.1")
+        .replace("rate = 5\n", "rat = 5\n")
         + '[[agents]]\nmodel = "crat"\n[law]\nname = "tan"\n'
     )
     found = wrong(text, tmp_path)
     assert [one.partition(":")[0] for one in found] == [
-        "k", "agents[0].count", "agents[0].dim", "agents[0].colour", "agents[1].model", "law.name", "duraton",
+        "k", "agents[0].count", "agents[0].dim", "agents[0].colour", "agents[1].model", "law.name", "delta",
+        "theta.rate", "duraton",
     ]  # fmt: skip
     text = MINIMAL.replace("[[0, 1], [1, 2]]", "[[0, 9], [1, 1], [1, 2]]").replace("final = 0.1", "final = -0.1")
     found = wrong(text.replace("[theta]", NOISE + "amplitude = nan\n" + NOISE + "[theta]\nrat = 1"), tmp_path)

@@ -13,7 +13,7 @@ import khop_env
 from khop_env import consensus_v0, leader_following_v0
 from khop_env.env import JointEnv, KHopEnv, KHopVectorEnv
 from khop_env.env.sb3 import KHopSB3VecEnv
-from khop_env.testing import CHECKS, Report, check_environment, difference
+from khop_env.testing import CHECKS, Check, Report, check_environment, difference
 from tests.walkers import FAULTS, HORIZON, Buffered, LikeMpe2, Siamese, Walkers
 
 ONLY = Walkers()
@@ -151,6 +151,12 @@ def test_checks_that_are_left_out_and_episodes_that_do_not_end():
 def test_what_it_refuses(env, arguments, message):
     with pytest.raises(ValueError, match=message):
         check_environment(env, **arguments)
+
+
+def test_failures_are_listed_last_where_they_are_seen():
+    statuses = ("passed", "failed", "skipped", "failed", "passed")
+    report = Report("mine", tuple(Check(f"check{q}", "claim", status) for q, status in enumerate(statuses)))
+    assert [line.split()[1] for line in str(report).splitlines()[1:]] == [f"check{q}" for q in (0, 2, 4, 1, 3)]
 
 
 def test_the_table_fits_80_columns_and_names_all():
