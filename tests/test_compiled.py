@@ -50,8 +50,8 @@ def entry(folder: Path) -> Path:
 def test_a_kernel_is_compiled_once(folder, capsys):
     assert not found()
     assert capsys.readouterr().err == (
-        "khop_env: compiling what is used for the first time on this machine (some seconds; the result is kept for later "
-        "runs) ...\n"
+        "khop_env: compiling what is used for the first time on this machine (some seconds; the result is kept for "
+        "later runs) ...\n"
     )
     assert found()
     compiled(kernel).recompile()

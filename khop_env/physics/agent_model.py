@@ -38,7 +38,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def or_did_you_mean(name: object, known: Iterable[str]) -> str:
-    """ "; did you mean 'x'?" after a list of all known names, which needn't be repeated; or nothing."""
+    """End of an error message that lists all known names already: the closest one, or nothing."""
     nearest = difflib.get_close_matches(str(name), list(known), n=1)
     return f"; did you mean {nearest[0]!r}?" if nearest else ""
 
