@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 # M. Okabe and K. Ito, Color Universal Design, 2008: distinguishable for colour-blind readers; without yellow (too pale)
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#8C8C8C")
 _ERROR, _DISAGREEMENT = COLORS[0], COLORS[3]
+_PALE = 0.4
 _BY_HOPS = (COLORS[2], COLORS[0], COLORS[3], *COLORS[4:])
 _MOST_LABELS = 12  # agents with a colour each in panel (a)
 _MOST_POINTS = 500_000  # plotted in panel (a)
@@ -271,10 +272,11 @@ def _draw_bounds(axes: Axes, recording: Recording, record: MessageRecord, agent:
         ]
         links = f"{hops} link{'s' if hops > 1 else ''}"
         error, bound = np.abs(record.error[:, columns]).max(axis=1), record.bound[:, columns].max(axis=1)
-        axes.plot(record.time, np.where(bound < np.inf, bound, np.nan), color=color, linestyle=(0, (5, 2)))
+        drawn = np.where((bound > 0.0) & (bound < np.inf), bound, np.nan)  # a gap where it is 0: the axis has none
+        axes.plot(record.time, drawn, color=color, alpha=_PALE)  # pale: dashes get lost in teeth of single messages
         axes.plot(record.time, np.where(error > 0.0, error, np.nan), color=color, linewidth=1.0, label=links)
     axes.plot([], [], color="#333333", label="largest |error|")
-    axes.plot([], [], color="#333333", linestyle=(0, (5, 2)), label="largest bound")
+    axes.plot([], [], color="#333333", alpha=_PALE, label="largest bound")
     low, high = axes.get_ylim()
     axes.set_ylim(max(low, 1e-6 * high), high * (high / max(low, 1e-6 * high)) ** 0.2)  # room for the legend
     axes.set_xlim(0.0, float(record.time[-1]) or 1.0)

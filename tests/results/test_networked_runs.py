@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+from matplotlib.figure import Figure
 
 from agents import make_law
 from khop_env.env.rendering import Renderer, Scene
@@ -123,6 +124,22 @@ def test_what_is_not_certified_is_drawn_without_a_box(run, tmp_path):
     recording, _ = run
     unknown = replace(recording.states, bound=np.full_like(recording.states.bound, np.inf))
     assert paper_figure(replace(recording, states=unknown), paper(), tmp_path / "figure.png", agent=7).exists()
+
+
+def test_bounds_that_are_0_are_left_out_of_a_logarithmic_axis(run, tmp_path, monkeypatch):
+    """An agent that has just heard another one knows its state exactly."""
+    recording, _ = run
+    columns = [start + c for pair, start in recording.states.layout.slot.items() if pair[1] == 7 for c in range(2)]
+    bound = recording.states.bound.copy()
+    bound[10:-1:5, columns] = 0.0
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **options: drawn.extend(figure.axes))
+    known = replace(recording, states=replace(recording.states, bound=bound))
+    paper_figure(known, paper(), tmp_path / "figure.png", agent=7)
+    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in drawn[2].lines])
+    assert drawn[2].get_yscale() == "log"
+    assert np.isnan(values).any()
+    assert not (values <= 0.0).any()
 
 
 def test_a_film_shows_what_the_simulator_would(run, tmp_path, monkeypatch):
