@@ -128,12 +128,15 @@ def print_table(
 
 
 def folded(name: str) -> str:
-    """A long name in several lines, which end at its own separators."""
+    """A long name in several lines, which end at its own separators; the last ones are filled first.
+
+    So "filter:" and "nav.py:Swirl" stay whole.
+    """
     lines = [""]
-    for piece in re.split(r"(?<=[/:,@-])", name):
-        if lines[-1] and len(lines[-1]) + len(piece) > _LONGEST_NAME:
-            lines.append("")
-        lines[-1] += piece
+    for piece in reversed(re.split(r"(?<=[/:,@-])", name)):
+        if lines[0] and len(lines[0]) + len(piece) > _LONGEST_NAME:
+            lines.insert(0, "")
+        lines[0] = piece + lines[0]
     return "\n".join(lines)
 
 

@@ -104,3 +104,17 @@ def test_outcomes_of_an_episode_in_words(capsys):
         "their goals, after 3.21 s in the mean; inputs changed by 0.125 m/s in the mean, a guarantee begun anew in 1 % "
         "of agents and time"
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "lines"),
+    [
+        ("tanh", ["tanh"]),
+        ("filter:nav.py:Swirl", ["filter:", "nav.py:Swirl"]),
+        ("filter:margin=0.3:nav.py:Swirl", ["filter:margin=0.3:", "nav.py:Swirl"]),
+        ("ppo:runs/train/consensus_v0-ppo-0", ["ppo:runs/train/", "consensus_v0-ppo-0"]),
+        ("a_word_without_any_separator", ["a_word_without_any_separator"]),
+    ],
+)
+def test_a_long_name_is_folded_at_its_separators_from_its_end(name, lines):
+    assert terminal.folded(name).split("\n") == lines

@@ -327,7 +327,9 @@ def _name(row: Row, comparison: Comparison) -> str:
     """Policy, mode, and the number of episodes if some are missing."""
     count = len(row.episodes.seed)
     few = "" if count == comparison.planned else f"\n({count} episodes)"
-    return f"{folded(row.policy)} on {row.observe}{few}"
+    name = folded(row.policy)
+    space = "\n" if "\n" in name else " "
+    return f"{name}{space}on {row.observe}{few}"
 
 
 def _by_network(comparison: Comparison) -> Iterator[tuple[Row, list[tuple[str, ...]]]]:
