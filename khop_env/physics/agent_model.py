@@ -229,7 +229,8 @@ class AgentModel:
             ValueError: The drift can't be evaluated on a batch, or returns a wrong shape.
         """
         environments, agents = self.n + 2, self.n + 1
-        x = np.random.default_rng(0).normal(size=(agents, self.n, environments)).transpose(2, 0, 1)  # as in a simulator
+        columns = np.random.default_rng(0).normal(size=(agents, self.n, environments))
+        x = read_only(columns.transpose(2, 0, 1))  # as in a simulator, so that nothing is compiled for this check alone
         t = np.zeros((environments, 1))
         f = self._evaluated(lambda: self.drift(t, x), x, "drift(t, x)")
         require_shape(self, f, x.shape, f"drift(t, x) on x of shape {x.shape}")

@@ -255,18 +255,20 @@ def test_extremes_show_a_state_that_is_not_finite():
 
 
 def test_a_wrong_shape_from_a_model_is_the_user_s_own_error():
-    """A user's mistake names the model, and a user's own exception comes through as it is."""
+    """A user's mistake names the model, and a user's own exception in a step comes through as it is."""
 
     class Flat(Broken):
         type = "flat"
 
         def drift(self, t, x):
-            return x[..., 0]
+            return x if len(x) > 1 else x[..., 0]  # right where the fleet checks it
 
     class Raising(Broken):
         type = "raising"
 
         def drift(self, t, x):
+            if len(x) > 1:
+                return x
             raise KeyError("mine")
 
     for model, error, message in ((Flat, ValueError, "Flat.drift"), (Raising, KeyError, "mine")):
