@@ -186,10 +186,10 @@ def compare(
     for name, names in (("policies", policies), ("observe", observe)):
         if isinstance(names, str):
             raise ValueError(f"{name} must be a list of names, e.g. [{names!r}]; got {names!r}")
-        for one in names:
-            if not isinstance(one, str):
+        for each in names:
+            if not isinstance(each, str):
                 raise ValueError(
-                    f"{name} must be names, which each process can look up; got {one!r}. For objects: "
+                    f"{name} must be names, which each process can look up; got {each!r}. For objects: "
                     "evaluate(env, {'mine': policy}, seeds), or a file's, 'my_file.py:MyPolicy'"
                 )
     if not policies or not observe or len(set(observe)) < len(observe):

@@ -54,15 +54,15 @@ def public_names() -> dict[str, str]:
     return _known
 
 
-def markup(app: Any, what: str, name: str, obj: Any, options: Any, given: list[str]) -> None:
-    """Handler of autodoc's event for docstrings: changes the lines `given` before napoleon reads their sections."""
+def markup(app: Any, what: str, name: str, obj: Any, options: Any, docstring: list[str]) -> None:
+    """Handler of autodoc's event for docstrings: changes its lines before napoleon reads their sections."""
     if what == "data":
-        given[:] = _below(name.rpartition(".")[2], obj)
+        docstring[:] = _below(name.rpartition(".")[2], obj)
     if isinstance(obj, type) and (bases := _bases(obj)):
-        end = given.index("") if "" in given else len(given)  # of the first paragraph, which overviews show
-        given[end:end] = ["", bases]
+        end = docstring.index("") if "" in docstring else len(docstring)  # of the first paragraph, which overviews show
+        docstring[end:end] = ["", bases]
     section, kinds = False, []
-    for line in given:
+    for line in docstring:
         if line and not line.startswith(" "):
             section = bool(re.fullmatch(r"[A-Z][A-Za-z ]*:", line))
         if line:
@@ -70,7 +70,7 @@ def markup(app: Any, what: str, name: str, obj: Any, options: Any, given: list[s
         else:
             kinds.append(bool(kinds) and kinds[-1])  # an empty line belongs to what is above it
     # fields of reStructuredText: napoleon would take what stands before a colon for a type
-    lines = [re.sub(r"^(Returns|Yields):$", lambda found: f":{found[1]}:", line) for line in given]
+    lines = [re.sub(r"^(Returns|Yields):$", lambda found: f":{found[1]}:", line) for line in docstring]
     changed: list[str] = []
     for is_code, group in groupby(zip(kinds, lines, strict=True), key=lambda pair: pair[0]):
         block = [line for _, line in group]
@@ -79,7 +79,7 @@ def markup(app: Any, what: str, name: str, obj: Any, options: Any, given: list[s
         changed = GoogleDocstring(changed, app.config, app, "method", name, obj, options).lines()
         if ":" in "".join(changed[:1]):
             changed[:0] = ["..", ""]
-    given[:] = changed
+    docstring[:] = changed
 
 
 def signature(app: Any, what: str, name: str, obj: Any, options: Any, given: str, returned: str) -> tuple[str, str]:

@@ -17,7 +17,7 @@ from khop_env.env.actuators import ACTUATORS
 from khop_env.network import NO_NETWORK
 from khop_env.observers import Networked
 from khop_env.results.data_columns import ESTIMATE_COLUMNS, DataColumn, merged, step_columns
-from khop_env.results.episodes import Part
+from khop_env.results.episodes import Part, network_in_words
 
 DESCRIPTION = "dataset.json"
 TABLES = ("steps", "estimates")
@@ -78,7 +78,7 @@ class EpisodeDataset:
                 {
                     "policy": policy,
                     "observe": env.settings.observe,
-                    "network": network or (NO_NETWORK if over is None else over.network.described()),
+                    "network": network or network_in_words(env),
                     "estimator": None if over is None else over.estimator.name,
                     "bound": env.simulator.error_bounds().basis,
                     "arguments": arguments(env),

@@ -43,6 +43,12 @@ class Part(NamedTuple):
     data: bytes
 
 
+def network_in_words(env: BatchedEnv) -> str:
+    """The network over which an environment's agents exchange messages; "none" for continuous exchange."""
+    observers = env.simulator.observers
+    return observers.network.described() if isinstance(observers, Networked) else NO_NETWORK
+
+
 class EpisodeRecorder:
     """Turns the episodes of a `BatchedEnv`, as they are played, into rows of the two tables.
 
@@ -68,8 +74,7 @@ class EpisodeRecorder:
         self, env: BatchedEnv, policy: str, network: str | None = None, columns: Mapping[str, DataColumn] | None = None
     ) -> None:
         self._env, observers = env, env.simulator.observers
-        own = observers.network.described() if isinstance(observers, Networked) else NO_NETWORK
-        self._labels = (policy, env.settings.observe, network or own, env.scenario)
+        self._labels = (policy, env.settings.observe, network or network_in_words(env), env.scenario)
         self._columns = dict(columns or step_columns(env))
         self._places: dict[str, tuple[str, list[int], list[int]]] = {}
         for each in quantities(env):
@@ -183,9 +188,7 @@ class EpisodeRecorder:
                 columns[name] = pl.Series(name, [None], dtype).new_from_index(0, shape[0] * shape[1])
                 continue
             source, agents, places = self._places[name]
-            values: Array = np.zeros(
-                shape, {"Float64": np.float64, "Float32": np.float32, "Boolean": np.bool_}[column.dtype]
-            )
+            values: Array = np.zeros(shape, _DTYPES[column.dtype])
             present = np.zeros(shape, np.bool_)
             values[:, agents] = flat[source][:, places]
             present[:, agents] = acted[:, None] if source not in ("x", "obs") else True
