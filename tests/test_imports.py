@@ -22,6 +22,7 @@ RANKS = [
         "khop_env.extras",
         "khop_env.own_agents",
         "khop_env.objects",
+        "khop_env.threads",
     ],
     ["khop_env.elementary"],
     ["khop_env.physics"],

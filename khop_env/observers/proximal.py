@@ -18,6 +18,7 @@ from khop_env.observers.layout import FloatArray
 from khop_env.observers.prediction import Prediction
 from khop_env.observers.solve import MAX_ITERATIONS
 from khop_env.observers.solver import Solver
+from khop_env.threads import Threads
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,9 @@ class Proximal(FunnelObservers):
         self._rates = tuple(np.zeros((pairs, num_envs)) for _ in stages)
         self._slopes = tuple(np.zeros((pairs, num_envs)) for _ in stages)
         self._input_slopes = tuple(np.zeros((input_pairs, num_envs)) for _ in stages)
-        self._solve_states = Solver(design.states.layout, num_envs, self.threads)
-        self._solve_inputs = Solver(design.inputs.layout, num_envs, self.threads)
+        self._threads = Threads(self.threads)
+        self._solve_states = Solver(design.states.layout, num_envs, self._threads)
+        self._solve_inputs = Solver(design.inputs.layout, num_envs, self._threads)
 
     def allocate(self) -> Memory:
         """Estimates and warm starts."""

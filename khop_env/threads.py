@@ -1,0 +1,52 @@
+"""Threads that share the environments of a batch; compiled code doesn't hold the GIL."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+
+Range: TypeAlias = tuple[int, int]
+"""First index and one past the last."""
+T = TypeVar("T")
+
+
+class Threads:
+    """A number of threads, started when they are first needed; the calling thread is one of them.
+
+    Args:
+        count: number of threads.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._pool: tuple[int, ThreadPoolExecutor] | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_pool": None}  # threads don't survive pickling
+
+    def ranges(self, size: int, least: int = 1) -> list[Range]:
+        """As many equal parts of range(size) as there are threads; fewer where a part would be below `least`."""
+        count = max(1, min(self.count, size // least))
+        return list(itertools.pairwise(np.linspace(0, size, count + 1).astype(int).tolist()))
+
+    def run(self, function: Callable[[Range], T], ranges: Sequence[Range]) -> list[T]:
+        """`function` of every range, at once, and the results in their order.
+
+        If some raise, all of them end first, and the first error is raised.
+        """
+        if len(ranges) == 1:
+            return [function(ranges[0])]
+        if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads
+            self._pool = os.getpid(), ThreadPoolExecutor(max(1, self.count - 1))
+        others = [self._pool[1].submit(function, part) for part in ranges[1:]]
+        try:
+            first = function(ranges[0])
+        finally:
+            for other in others:
+                other.exception()  # waits
+        return [first, *(other.result() for other in others)]
