@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,6 +49,20 @@ TABLEAUS = {
 MOST_THREADS = 256
 
 
+class Stages(NamedTuple):
+    """The parts of a step's stages.
+
+    Attributes:
+        predicted: (stages, P, B) f(x_hat) + g_hat at the stage before.
+        slopes: (stages, P, B) the state observers' correction at the stage.
+        input_slopes: (stages, Q, B) the input observers'.
+    """
+
+    predicted: FloatArray
+    slopes: FloatArray
+    input_slopes: FloatArray
+
+
 class Proximal(FunnelObservers):
     """Proximal step: the barrier is implicit, everything else explicit; |e| < 1 at every grid point for any step.
 
@@ -60,6 +75,8 @@ class Proximal(FunnelObservers):
 
     Attributes:
         evaluations: of the barrier, in all steps so far.
+        prediction: f(x_hat) + g_hat, once prepared.
+        stages: the parts of the last step, once prepared.
 
     Raises:
         ValueError: if there is no such order, or threads is out of range.
@@ -78,6 +95,8 @@ class Proximal(FunnelObservers):
         self._tableau = TABLEAUS[order]
         self._explicit, self._implicit = self._tableau.explicit, self._tableau.implicit
         self._dt = math.nan
+        nothing = np.zeros((0, 0))
+        self._scheme = math.nan, (nothing, nothing, nothing)
 
     def __repr__(self) -> str:
         return f"Proximal(order={self.order}, threads={self.threads})"
@@ -85,12 +104,10 @@ class Proximal(FunnelObservers):
     def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
         """Allocate the buffers for steps of `design` in `num_envs` environments."""
         super().prepare(design, num_envs, assumed)
-        stages = range(len(self._tableau.nodes))
-        pairs, input_pairs = design.states.layout.size, design.inputs.layout.size
-        self._prediction = Prediction(design, num_envs)
-        self._rates = tuple(np.zeros((pairs, num_envs)) for _ in stages)
-        self._slopes = tuple(np.zeros((pairs, num_envs)) for _ in stages)
-        self._input_slopes = tuple(np.zeros((input_pairs, num_envs)) for _ in stages)
+        count, pairs, input_pairs = len(self._tableau.nodes), design.states.layout.size, design.inputs.layout.size
+        self.prediction = Prediction(design, num_envs)
+        self.stages = Stages(*(np.zeros((count, size, num_envs)) for size in (pairs, pairs, input_pairs)))
+        self._rates, self._slopes, self._input_slopes = (tuple(each) for each in self.stages)
         self._threads = Threads(self.threads)
         self._solve_states = Solver(design.states.layout, num_envs, self._threads)
         self._solve_inputs = Solver(design.inputs.layout, num_envs, self._threads)
@@ -110,7 +127,7 @@ class Proximal(FunnelObservers):
         estimate, input_estimate = memory["estimate"], memory["input_estimate"]
         for s, node in enumerate(self._tableau.nodes):
             # rates at the stage before: the state holds that stage's values, at its time
-            self._prediction.rate(state.t, estimate, input_estimate, self._rates[s])
+            self.prediction.rate(state.t, estimate, input_estimate, self._rates[s])
             explicit, implicit, tau = weights[s]
             plant.stage(s, explicit, node * dt, before, state)
             weighted_sum(last["estimate"], explicit, self._rates[: s + 1], estimate)
@@ -119,7 +136,7 @@ class Proximal(FunnelObservers):
             rho = self.rho.at(state.t)
             of_states, of_inputs = weights_at(self.links, state)
             found = self._solve_states(tau, estimate, state.x, rho, memory["eps"], self._slopes[s], of_states)
-            self._account(found, self.design.states, state.x, rho)
+            self.account(found, self.design.states, state.x, rho)
             plant.actuate(state)
             if self.design.inputs.layout.size:
                 if s:
@@ -127,7 +144,17 @@ class Proximal(FunnelObservers):
                 omega = self.omega.at(state.t)
                 slope = self._input_slopes[s]
                 found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], slope, of_inputs)
-                self._account(found, self.design.inputs, state.g, omega)
+                self.account(found, self.design.inputs, state.g, omega)
+
+    def scheme(self, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times of the stages (S,), explicit and implicit weights (S, S), all in s, for a step of `dt` seconds."""
+        if dt != self._scheme[0]:
+            count = len(self._tableau.nodes)
+            explicit, implicit = np.zeros((count, count)), np.zeros((count, count))
+            for s, (a, b, _) in enumerate(self._weights_of(dt)):
+                explicit[s, : s + 1], implicit[s, : s + 1] = a, b
+            self._scheme = dt, (np.array(self._tableau.nodes) * dt, explicit, implicit)
+        return self._scheme[1]
 
     def _weights_of(self, dt: float) -> list[tuple[FloatArray, FloatArray, float]]:
         """Per stage the explicit weights, the implicit ones, and the last of these, all in s."""
@@ -137,10 +164,8 @@ class Proximal(FunnelObservers):
             self._dt = dt
         return self._weights
 
-    def _account(
-        self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray
-    ) -> None:
-        """Count the work of a solve.
+    def account(self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray) -> None:
+        """Count the work of a solve of `funnels`, of the values `source` within `rho`, range by range.
 
         Raises:
             SolveError: if the solve failed, with the reason.

@@ -63,7 +63,9 @@ class Runs(NamedTuple):
     @classmethod
     def of(cls, parts: Sequence[tuple[AgentModel, int, int, int]]) -> Runs:
         """Runs of (model, agents, first row, first row of inputs); the models have a compiled form."""
-        return _runs([(model.form, agents, model.n, model.m, *first) for model, agents, *first in parts])
+        forms = [_with_form(model) for model, *_ in parts]
+        sizes = [(agents, model.n, model.m, row, input_row) for model, agents, row, input_row in parts]
+        return _runs([(form, *each) for form, each in zip(forms, sizes, strict=True)])
 
 
 @compiled
@@ -254,6 +256,11 @@ def evaluated(kernel: Callable[..., None], form: Form, width: int, *arguments: F
     return out.reshape(agents, width, batch).transpose(2, 0, 1).reshape(*shape, width)
 
 
+def _with_form(model: AgentModel) -> Form:
+    assert model.form is not None
+    return model.form
+
+
 @functools.lru_cache(maxsize=256)
 def _one_run(form: Form, states: int, inputs: int, agents: int) -> tuple[Any, ...]:
     return tuple(_runs([(form, agents, states, inputs, 0, 0)]))
@@ -264,5 +271,6 @@ def _runs(parts: Sequence[tuple[Form, int, int, int, int, int]]) -> Runs:
     for form, *sizes in parts:
         rows.append((form.kind, *sizes, len(parameters)))
         parameters += form.parameters
-    columns = np.ascontiguousarray(np.array(rows, np.int64).reshape(-1, 7).T)
-    return Runs(*columns, np.array(parameters, np.float64))
+    table = np.array(rows, np.int64).reshape(-1, 7)
+    kind, agents, states, inputs, row, input_row, first = (np.ascontiguousarray(column) for column in table.T)
+    return Runs(kind, agents, states, inputs, row, input_row, first, np.array(parameters, np.float64))

@@ -24,13 +24,13 @@ class Form(NamedTuple):
 
     Attributes:
         kind: SINES, GUSTS or COUPLING.
-        count: Number of sines or pulses of a channel.
+        number: Of sines or pulses of a channel.
         first: Duration of a pulse in seconds, or the coupling's gain in 1/m.
         second: Length of a window in seconds.
     """
 
     kind: int
-    count: int = 0
+    number: int = 0
     first: float = 0.0
     second: float = 0.0
 
@@ -39,24 +39,24 @@ class TermArrays(NamedTuple):
     """Several disturbances of the library, attached to a fleet.
 
     Attributes:
-        kind: Of each, with `count`, `first` and `second` as in `Form`, shape (T,).
-        count: Shape (T,).
+        kind: Of each, with `number`, `first` and `second` as in `Form`, shape (T,).
+        number: Shape (T,).
         first: Shape (T,).
         second: Shape (T,).
         begin: Where its draws begin among those of an episode, shape (T,).
-        channel: Where its channels begin in `index` and `amplitude`, and their number at the end, shape (T + 1,).
-        index: Components of the state that it acts on, of all.
+        channel: Where its channels begin in `component` and `amplitude`, and their number at the end, shape (T + 1,).
+        component: Components of the state that it acts on, of all.
         amplitude: Bound of each.
         positions: Where all agents' positions sit in the state, shape (N, d).
     """
 
     kind: IndexArray
-    count: IndexArray
+    number: IndexArray
     first: FloatArray
     second: FloatArray
     begin: IndexArray
     channel: IndexArray
-    index: IndexArray
+    component: IndexArray
     amplitude: FloatArray
     positions: IndexArray
 
@@ -69,9 +69,9 @@ def disturb(terms: Any, t: FloatArray, x: FloatArray, drawn: FloatArray, out: Fl
         for e in range(high - low):
             out[row, place(low + e)] = 0.0
     for k in range(terms.kind.size):
-        part = terms.index[terms.channel[k] : terms.channel[k + 1]]
+        part = terms.component[terms.channel[k] : terms.channel[k + 1]]
         amplitude = terms.amplitude[terms.channel[k] : terms.channel[k + 1]]
-        kind, begin, count, first = terms.kind[k], terms.begin[k], terms.count[k], terms.first[k]
+        kind, begin, count, first = terms.kind[k], terms.begin[k], terms.number[k], terms.first[k]
         if kind == SINES:
             add_sines(t, drawn, begin, count, part, amplitude, out, low, high)
         elif kind == GUSTS:

@@ -1,6 +1,7 @@
 """Plant and observers advance together: the plant's stepper, the simulator, its state, and the view of a law."""
 
 from khop_env.simulation.arena import Arena, Obstacle
+from khop_env.simulation.edge_law import EdgeLaw
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant
 from khop_env.simulation.simulator import Simulator
@@ -10,6 +11,7 @@ from khop_env.simulation.view import OBSERVE, Law, Observe, View, ViewBuilder
 __all__ = [
     "OBSERVE",
     "Arena",
+    "EdgeLaw",
     "FleetPlant",
     "InitialSet",
     "Law",

@@ -28,10 +28,12 @@ from khop_env.observers import (
 from khop_env.observers.disagreement import disagreement_by
 from khop_env.observers.funnel_observers import LinksNow, weights_at
 from khop_env.physics import read_only
+from khop_env.simulation.compiled_step import compiled_step
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
 from khop_env.simulation.state import SimulatorState
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
+from khop_env.threads import Threads
 
 _WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
 
@@ -89,7 +91,8 @@ class Simulator:
         self.observers.prepare(design, num_envs, Assumptions(initial.center, initial.radius, pushed))
         self.task_graph = nx.empty_graph(len(self.fleet)) if task is None else task
         views = None if law is None else ViewBuilder(design, self.observers, self.task_graph, observe, num_envs)
-        self.plant = FleetPlant(self.fleet, num_envs, attached, law, views, saturated=self.observers.by_messages)
+        threads, saturated = Threads(getattr(self.observers, "threads", 1)), self.observers.by_messages
+        self.plant = FleetPlant(self.fleet, num_envs, attached, law, views, saturated=saturated, threads=threads)
         self.state = SimulatorState(
             t=np.zeros(num_envs),
             x=np.zeros((self.fleet.n, num_envs)),
@@ -99,6 +102,7 @@ class Simulator:
             memory=self.observers.allocate(),
         )
         self._before, self._interrupted = self.state.copy(), False
+        self._compiled = compiled_step(self.plant, self.observers, self.state, self._before)
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach = np.abs(initial.center) + initial.radius
         self._longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
@@ -268,9 +272,13 @@ class Simulator:
         state, before, copied = self.state, self._before, self.observers.copied
         whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
         start = state.copy() if parts > 1 else before
-        state.copy_step(before, copied)
+        if self._compiled is None:
+            state.copy_step(before, copied)
         try:
             for part in range(parts):
+                if self._compiled is not None:
+                    self._compiled(dt / parts, self.running_extremes)
+                    continue
                 if part:
                     state.copy_step(before, copied)
                 self.observers.advance(self.plant, before, state, dt / parts)
