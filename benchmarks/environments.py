@@ -76,7 +76,7 @@ def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str
     for name, holder, attributes in (
         ("solve", observers, ("_solve_states", "_solve_inputs")),
         ("right-hand sides", simulator.plant, ("rate", "actuate")),
-        ("right-hand sides", observers._prediction, ("rate",)),
+        ("right-hand sides", observers.prediction, ("rate",)),
         ("observation", env, ("_read_observations",)),
     ):
         for attribute in attributes:
