@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from khop_env.catalog import ENVIRONMENTS
+from khop_env.catalog import ENVIRONMENTS, describe
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
 from khop_env.extras import how_to_install
 from khop_env.network import Network
 from khop_env.objects import is_object_name, load_object
 from khop_env.observers import Networked, Observers, Proximal
 from khop_env.physics import did_you_mean
-from khop_env.scenarios.named import SCENARIOS, describe, parameters_from_text, scenario, scenarios
+from khop_env.scenarios.named import SCENARIOS, parameters_from_text, scenario, scenarios
 from khop_env.scenarios.scenario import Scenario
 from khop_env.tasks import Task
 
