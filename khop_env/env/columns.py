@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ from khop_env.env.readout import (
     Column,
     Readout,
 )
+from khop_env.env.sharing import alike, kinds, unify_bounds
 from khop_env.observers import IntArray, Observers
 from khop_env.physics import Fleet
 from khop_env.simulation import Observe
@@ -110,11 +110,11 @@ class ObservationColumns:
         models = self._fleet.models
         self._types = list(dict.fromkeys(model.type for model in models))
         self._axes = axis_names(self._fleet.position_dim)
-        self._kinds = _kinds(self._fleet)
-        kinds = set(self._kinds)
-        self._features = {kind: features(models[kind]) for kind in kinds}
+        self._kinds = kinds(self._fleet)
+        different = set(self._kinds)
+        self._features = {kind: features(models[kind]) for kind in different}
         self._most_rest = max(len(rest) for _, rest in self._features.values())
-        self._most_states, self._most_inputs = (max(getattr(models[i], size) for i in kinds) for size in "nm")
+        self._most_states, self._most_inputs = (max(getattr(models[i], size) for i in different) for size in "nm")
         self._slot_fields: dict[tuple[int, int], _SlotFields] = {}
         self._fields: dict[Field, Field] = {}
         start = design.states.delta.evaluate(np.zeros(1), np.empty((design.states.layout.rows, 1)))
@@ -130,13 +130,13 @@ class ObservationColumns:
         if uniform:
             self._require_equal_counts(agents)
             self._pad(columns, [len(its_slots) for its_slots in slots])
-        alike, groups = _alike(columns)
+        group_of, groups = alike(columns)
         if uniform:
-            _unify_bounds(columns, alike, groups)
+            unify_bounds(columns, group_of, groups)
         first = [ObservationLayout(self._fleet.ids[agents[0]], fields, ()) for fields in groups]
         self.layouts = [
             first[group].shared_by(self._fleet.ids[i], its_slots)
-            for i, its_slots, group in zip(agents, slots, alike, strict=True)
+            for i, its_slots, group in zip(agents, slots, group_of, strict=True)
         ]
         sizes = [len(its_columns) for its_columns in columns]
         self.readout = Readout(
@@ -184,10 +184,11 @@ class ObservationColumns:
         most_hops = float(self._design.k)
         if self._by_messages:  # detours are possible
             most_hops = float(max(self._design.k, len(self._fleet) - 1))
+        edge = _flag(f"{name}.task_edge", False)
         ranges = (("valid", "", 1.0), ("heard", "", 1.0), ("hops", "", most_hops), ("age", "s", self._limit))
         found = self._slot_fields[number, kind] = _SlotFields(
             [Field(f"{name}.{what}", unit, 0.0, high) for what, unit, high in ranges],
-            (_flag(f"{name}.task_edge", False), _flag(f"{name}.task_edge", True)),
+            (edge, edge._replace(value=1.0)),
             self._type(name, model.type) if len(self._types) > 1 else [],
             [
                 (
@@ -288,54 +289,6 @@ class ObservationColumns:
                     name = f"slot{number}"
                     padding[number, slot_width] = [_flag(f"{name}.valid", False), *self._padding(name, slot_width - 1)]
                 its_columns += padding[number, slot_width]
-
-
-def _kinds(fleet: Fleet) -> list[int]:
-    """Per agent the first with the same states, inputs and position."""
-    first: dict[tuple[str, ...], int] = {}
-    known: dict[int, int] = {}  # by the model's identity, which is found more quickly
-    for i, model in enumerate(fleet.models):
-        if id(model) not in known:
-            known[id(model)] = first.setdefault((model.type, *model.position), i)
-    return [known[id(model)] for model in fleet.models]
-
-
-def _alike(columns: list[list[Column]]) -> tuple[list[int], list[tuple[Field, ...]]]:
-    """Different sequences of fields, and per agent which of them is its own."""
-    numbers: dict[tuple[int, ...], int] = {}
-    groups: list[tuple[Field, ...]] = []
-    alike = []
-    for its_columns in columns:
-        fields = tuple(map(attrgetter("field"), its_columns))
-        number = numbers.setdefault(tuple(map(id, fields)), len(groups))
-        if number == len(groups):
-            groups.append(fields)
-        alike.append(number)
-    return alike, groups
-
-
-def _unify_bounds(columns: list[list[Column]], alike: list[int], groups: list[tuple[Field, ...]]) -> None:
-    """Give columns, and the groups' fields, common bounds for all agents, in place: one Box."""
-    low = [float(min(field.low for field in each)) for each in map(set, zip(*groups, strict=True))]
-    high = [float(max(field.high for field in each)) for each in map(set, zip(*groups, strict=True))]
-    one: dict[Field, Field] = {}
-    wider = []  # per group, the places of the fields whose bounds change
-    for number, fields in enumerate(groups):
-        places = [q for q, field in enumerate(fields) if field[2:] != (low[q], high[q])]
-        changed = list(fields)
-        for q in places:
-            field = Field(*fields[q][:2], low[q], high[q])
-            changed[q] = one.setdefault(field, field)
-        groups[number] = tuple(changed)
-        wider.append(places)
-    shared: dict[tuple[int, int], tuple[Column, Column]] = {}  # by place and identity; the old ones are kept alive
-    for its_columns, number in zip(columns, alike, strict=True):
-        fields = groups[number]
-        for q in wider[number]:
-            column = its_columns[q]
-            if (q, id(column)) not in shared:  # its values keep to their own bounds
-                shared[q, id(column)] = column, column._replace(field=fields[q], clip=column.bounds)
-            its_columns[q] = shared[q, id(column)][1]
 
 
 def state_columns(fleet: Fleet, i: int, name: str, limit: float) -> list[Column]:
