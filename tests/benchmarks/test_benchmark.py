@@ -57,6 +57,10 @@ def test_every_promised_figure_is_printed():
         "ratio_to_floor",
         "growth_time",
         "growth_memory",
+        "environment_growth_time",
+        "environment_growth_memory",
+        "wifi_growth_time",
+        "wifi_growth_memory",
         "training",
         "training_environment_share",
         "network_relay_ratio",
@@ -69,6 +73,7 @@ def test_every_promised_figure_is_printed():
     assert rows.pop("violations") == rows.pop("collisions_certified") == 0
     assert {f"filter_{place}_{how}" for place in ("apart", "crowd") for how in ("single", "batch")} <= set(rows)
     assert PARTS | RATES | {"environment_control_period", "environment_substeps"} <= set(rows)
+    assert {f"{kind}_making_1000" for kind in ("environment", "wifi")} <= set(rows)
     assert (rows["environment_control_period"], rows["environment_substeps"]) == (0.05, 1)
     assert all(np.isfinite(value) and value > 0 for value in rows.values())
     assert rows["proximal_error"] < 2e-3
@@ -162,7 +167,7 @@ def test_a_peer_that_fails_costs_its_ratio_only(tmp_path):
 @pytest.fixture
 def quick_parts(monkeypatch):
     """Parts that need the core only, with a row each."""
-    for index, name in enumerate(("_against_explicit", "_growth")):
+    for index, name in enumerate(("_against_explicit", "growth_rows")):
         monkeypatch.setattr(module, name, lambda add, *rest, index=index: add(f"row {index}", 1.0))
     monkeypatch.setattr(module, "_ratio_to_floor", lambda quick: 2.0)
     monkeypatch.setattr(module, "environment_rows", lambda report, *rest: report.add("row 2", np.inf))
