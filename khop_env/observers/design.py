@@ -254,7 +254,8 @@ class ObserverDesign:
             relay=self.relay,
             changing=self.schedule is not None,
         )
-        states, inputs = lay_out(), lay_out(targets=observed_inputs)
+        states = lay_out()
+        inputs = states if len(observed_inputs) == len(fleet) else lay_out(targets=observed_inputs)
         values = {
             "design_rule": rule,
             "links": links,
