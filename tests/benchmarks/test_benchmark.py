@@ -13,6 +13,7 @@ from benchmarks import benchmark as module
 from benchmarks import environments, study
 from benchmarks.benchmark import benchmark
 from benchmarks.comparison import compare, left_out
+from benchmarks.growth import held_memory
 from benchmarks.report import Report
 from benchmarks.yardsticks import CompiledPaper
 from khop_env.observers import Explicit
@@ -253,3 +254,11 @@ def test_a_training_of_the_study_whose_mark_is_damaged_has_not_finished(tmp_path
     if text is not None:
         (tmp_path / study.DONE).write_text(text)
     assert study.seconds_of(tmp_path) == {"12": 12.0, "12.5\n": 12.5}.get(text)
+
+
+def test_memory_counts_arrays_and_objects_once_and_leaves_out_what_is_shared():
+    shared, own = np.zeros(10_000), np.zeros(20_000)
+    subject = {"own": own, "view": own[5:], "again": [own], "shared": shared[1:]}
+    held = held_memory([subject], besides=[shared])
+    assert own.nbytes < held < own.nbytes + 3000
+    assert own.nbytes + shared.nbytes < held_memory([subject], besides=[])
