@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from khop_env.catalog import ENVIRONMENTS, describe
+from khop_env.collection import collection_paused
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
 from khop_env.extras import how_to_install
 from khop_env.network import Network
@@ -124,7 +125,8 @@ def make_batched(
     if settings.max_cycles is None:
         cycles = max(1, math.ceil(chosen.duration / settings.control_period - 1e-9))
         settings = dataclasses.replace(settings, max_cycles=cycles)
-    return BatchedEnv(chosen.build(observers=observers, num_envs=int(num_envs)), task, settings, chosen.name)
+    with collection_paused():
+        return BatchedEnv(chosen.build(observers=observers, num_envs=int(num_envs)), task, settings, chosen.name)
 
 
 def make(

@@ -19,6 +19,7 @@ RANKS = [
         "khop_env.compiled",
         "khop_env.catalog",
         "khop_env.brief",
+        "khop_env.collection",
         "khop_env.extras",
         "khop_env.own_agents",
         "khop_env.objects",

@@ -21,6 +21,7 @@ from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.estimators import Take
 from khop_env.observers.funnel_observers import WidthsNow
+from khop_env.observers.indexing import ranges
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 from khop_env.observers.prediction import Prediction
 from khop_env.observers.scalar import solve_alone
@@ -171,25 +172,22 @@ def _held(layout: PairLayout, estimate: int, own: int, relayed: dict[tuple[int, 
         own: row at which the fleet's own values begin.
         relayed: (relaying agent, target) -> row of the target's value in what that agent sends.
     """
-    arrays, sender = layout.arrays, layout.links.sender
-    link, row, source, offset = list[int](), list[int](), list[int](), list[int]()
-    start = [0]
-    for block in layout.blocks:
-        span = range(block.components)
-        for pair in range(block.pairs.start, block.pairs.stop):
-            offset.append(len(link))
-            entries = range(arrays.entry_start[pair], arrays.entry_start[pair + 1])
-            ways = [
-                (int(layout.entry_link[k]), estimate + block.columns.start + int(arrays.entry[k]) * block.components)
-                for k in entries
-            ]
-            for number in layout.relay_link[layout.relay_start[pair] : layout.relay_start[pair + 1]].tolist():
-                p, i = int(sender[number]), block.agent
-                ways.append((number, own + block.sources.start if p == i else relayed[p, i]))
-            for number, first in ways:
-                link += [number] * block.components
-                row += [first + c for c in span]
-                source += [block.sources.start + c for c in span]
-            start.append(start[-1] + len(ways))
-    parts = (link, row, start, offset, source)
-    return _Held(*(np.array(part, np.int64) for part in parts))
+    arrays, count = layout.arrays, layout.pairs
+    target, components = layout.pair_target, np.repeat(arrays.components, arrays.observers)
+    columns, sources = (np.repeat(each, arrays.observers) for each in (arrays.column, arrays.source))
+    of_entry = np.repeat(np.arange(count), np.diff(arrays.entry_start))
+    of_relay = np.repeat(np.arange(count), np.diff(layout.relay_start))
+    relaying = zip(layout.links.sender[layout.relay_link].tolist(), target[of_relay].tolist(), strict=True)
+    own_values = (own + sources[of_relay]).tolist()
+    relays = [value if p == i else relayed[p, i] for (p, i), value in zip(relaying, own_values, strict=True)]
+    pair = np.concatenate([of_entry, of_relay])
+    order = np.argsort(pair, kind="stable")
+    pair = pair[order]
+    link = np.concatenate([layout.entry_link, layout.relay_link])[order]
+    first = np.concatenate([estimate + columns[of_entry] + arrays.entry * components[of_entry], relays])[order]
+    size = components[pair]  # of each value that is held
+    start = np.concatenate([[0], np.cumsum(np.bincount(pair, minlength=count))])
+    way, row = ranges(first.astype(np.int64), size)
+    _, source = ranges(sources[pair], size)
+    offset = np.concatenate([[0], np.cumsum(size)])[start[:-1]]
+    return _Held(link[way], row, start, offset, source)

@@ -84,6 +84,11 @@ class EdgeTask(Task):
         super().bind(world)
         self.edges, self.displacement = self.relations(world)
         fleet, members = world.fleet, list(self.acting(world))
+        # of each edge a number that grows with it, for `_desired`
+        order = self.edges[:, 0] * len(fleet) + self.edges[:, 1]
+        self._by_number = np.argsort(order, kind="stable")
+        self._numbers = order[self._by_number]
+        self._reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
         number = {agent: place for place, agent in enumerate(members)}
         counted = np.array([i in number for i in self.edges[:, 0].tolist()], bool)
         edges, position = self.edges[counted], fleet.position_index
@@ -105,8 +110,7 @@ class EdgeTask(Task):
 
     def slot_columns(self, world: World, agent: int, other: int) -> Sequence[Column]:
         """The desired displacement along the edge; zeros without an edge."""
-        reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
-        desired = self._desired(agent, other)
+        reach, desired = self._reach, self._desired(world, agent, other)
         names = axis_names(world.fleet.position_dim)
         model = world.fleet.models[other]
         units = [model.states[name] for name in model.position]
@@ -139,9 +143,12 @@ class EdgeTask(Task):
         edges = [f"{ids[i]} to {ids[j]} by {d} m" for (i, j), d in zip(self.edges.tolist(), places, strict=True)]
         return {**super().signature(world), "task edges": tuple(edges)}
 
-    def _desired(self, agent: int, other: int) -> list[float]:
-        found = np.flatnonzero((self.edges[:, 0] == agent) & (self.edges[:, 1] == other))
-        return self.displacement[found[0]].tolist() if found.size else [0.0] * self.displacement.shape[1]
+    def _desired(self, world: World, agent: int, other: int) -> list[float]:
+        number = agent * len(world.fleet) + other
+        place = int(self._numbers.searchsorted(number))
+        if place < len(self._numbers) and self._numbers[place] == number:
+            return self.displacement[self._by_number[place]].tolist()
+        return [0.0] * self.displacement.shape[1]
 
 
 def require_positive(name: str, value: object) -> None:
