@@ -116,29 +116,42 @@ class Readout:
         self.uses_bounds = BOUND in kinds
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
-    def __call__(self, sources: Sources, clipped: IntArray) -> Float32Array:
-        """Vectors (B, columns) in new memory; adds the number of clipped values to `clipped` (B, owners)."""
-        out = np.empty((sources.x.shape[1], len(self.template)), np.float32)
-        fill(self._live, self.template, tuple(sources), out, clipped)
-        return out
+    def empty(self, num_envs: int) -> Float32Array:
+        """(B, columns) new memory for `write`."""
+        return np.empty((num_envs, len(self.template)), np.float32)
+
+    def write(self, sources: Sources, out: Float32Array, clipped: IntArray, low: int, high: int) -> None:
+        """Write the vectors of environments `low` to `high` into `out` (B, columns).
+
+        Args:
+            sources: of all environments.
+            out: overwritten.
+            clipped: (B, owners), to which the number of clipped values is added.
+            low: first environment.
+            high: one past the last.
+        """
+        fill(self._live, self.template, tuple(sources), out, clipped, low, high)
 
 
 @compiled
-def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, clipped: IntArray) -> None:
+def fill(
+    live: Any, template: Float32Array, sources: Any, out: Float32Array, clipped: IntArray, low: int, high: int
+) -> None:
     """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner.
 
-    `live` and `sources` are the fields of `_LiveColumns` and `Sources` as plain tuples.
+    `live` and `sources` are the fields of `_LiveColumns` and `Sources` as plain tuples; only environments `low` to
+    `high` are written.
     """
     live, sources = _LiveColumns(*live), Sources(*sources)
     x, estimate = sources.x, sources.estimate
     values = np.empty(_TILE)
-    for first in range(0, out.shape[0], _TILE):
-        width = min(_TILE, out.shape[0] - first)
+    for first in range(low, high, _TILE):
+        width = min(_TILE, high - first)
         for e in range(width):
             out[first + e] = template
         for q in range(live.column.size):
             column, kind, row, origin, owner = live.column[q], live.kind[q], live.row[q], live.origin[q], live.owner[q]
-            low, high = live.low[q], live.high[q]
+            least, most = live.low[q], live.high[q]
             if kind == STATE_RELATIVE:
                 for e in range(width):
                     values[e] = x[row, first + e] - x[origin, first + e]
@@ -154,7 +167,7 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
             elif kind == BOUND:
                 for e in range(width):
                     bound = sources.bound[row, first + e]
-                    values[e] = bound if bound < np.inf else high  # no bound: the largest value, and nothing clipped
+                    values[e] = bound if bound < np.inf else most  # no bound: the largest value, and nothing clipped
             elif kind == INPUT:
                 for e in range(width):
                     values[e] = sources.inputs[row, first + e]
@@ -185,19 +198,26 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
                     values[e] = values[e] * sources.known[gate, first + e] + 0.0  # no -0.0, whose sign would tell
             outside = 0
             for e in range(width):
-                outside += (values[e] < low) | (values[e] > high)
+                outside += (values[e] < least) | (values[e] > most)
             if outside:
                 for e in range(width):
-                    clipped[first + e, owner] += (values[e] < low) | (values[e] > high)
+                    clipped[first + e, owner] += (values[e] < least) | (values[e] > most)
             for e in range(width):
-                values[e] = min(max(values[e], low), high)
+                values[e] = min(max(values[e], least), most)
             for e in range(width):
                 out[first + e, column] = values[e]
 
 
 @compiled
 def summarize(
-    age: FloatArray, hops: FloatArray, since: FloatArray, t: FloatArray, period: float, out: FloatArray
+    age: FloatArray,
+    hops: FloatArray,
+    since: FloatArray,
+    t: FloatArray,
+    out: FloatArray,
+    period: float,
+    low: int,
+    high: int,
 ) -> None:
     """Write what agents know of the information that their estimates rest on, from `observers.Information`.
 
@@ -206,14 +226,16 @@ def summarize(
         hops: (pairs, B) links over which it came.
         since: (pairs, B) time since it arrived, in s.
         t: (B,) time since reset in s.
-        period: the control period in s.
         out: (4 pairs, B) overwritten: VALID, whether anything has arrived; HEARD, whether something newer has within
             the last control period; HOPS; AGE in s, and where nothing has arrived the time since reset.
+        period: the control period in s.
+        low: first environment.
+        high: one past the last.
     """
     pairs = age.shape[0]
     recent = period * (1.0 - 1e-6)  # what arrived with the observation before is a whole period old, but for rounding
     for q in range(pairs):
-        for e in range(t.size):
+        for e in range(low, high):
             valid = age[q, e] < np.inf
             out[VALID * pairs + q, e] = valid
             out[HEARD * pairs + q, e] = since[q, e] < recent

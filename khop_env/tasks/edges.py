@@ -6,11 +6,11 @@ import abc
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypedDict
+from typing import Any, Literal, NamedTuple, TypedDict
 
 import numpy as np
 
-from khop_env.compiled import compiled
+from khop_env.compiled import compiled, place
 from khop_env.observers import FloatArray, IntArray
 from khop_env.tasks.base import Column, Outcome, Signature, Task, World
 
@@ -91,7 +91,7 @@ class EdgeTask(Task):
         input_owner = np.full(fleet.m, -1, np.int64)
         for place, i in enumerate(members):
             input_owner[fleet.input_slice(i)] = place
-        self._arrays = EdgeArrays(
+        arrays = EdgeArrays(
             agent,
             np.ascontiguousarray(position[edges[:, 0]]),
             np.ascontiguousarray(position[edges[:, 1]]),
@@ -99,6 +99,7 @@ class EdgeTask(Task):
             1.0 / np.bincount(agent, minlength=len(members))[agent],
             input_owner,
         )
+        self._arrays: Any = tuple(arrays)  # Numba recognises the types of a plain tuple more quickly
         self._period = world.control_period
         self._squares = np.zeros((len(members), world.num_envs))
         self._efforts = np.zeros((len(members), world.num_envs))
@@ -120,7 +121,8 @@ class EdgeTask(Task):
         shape = world.num_envs, len(self._squares)
         reward, error = np.empty(shape), np.empty(shape)
         period, effort = world.control_period, float(self.effort)
-        evaluate_edges(self._arrays, world.x, world.inputs, period, effort, self._squares, self._efforts, reward, error)
+        arrays = self._arrays, world.x, world.inputs, self._squares, self._efforts, reward, error
+        world.each(lambda low, high: evaluate_edges(*arrays, period, effort, low, high))
         if self.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
         terminated = np.zeros(world.num_envs, bool)
@@ -172,43 +174,52 @@ def ring(count: int, dim: int) -> FloatArray:
 
 @compiled
 def evaluate_edges(
-    edges: EdgeArrays,
+    edges: Any,
     x: FloatArray,
     inputs: FloatArray,
-    period: float,
-    effort: float,
     squares: FloatArray,
     efforts: FloatArray,
     reward: FloatArray,
     error: FloatArray,
+    period: float,
+    effort: float,
+    low: int,
+    high: int,
 ) -> None:
-    """Write every agent's reward, and its root mean square error along its task edges.
+    """Write every agent's reward, and its root mean square error along its task edges, in environments low to high.
 
     Args:
-        edges: of the acting agents.
+        edges: of the acting agents, the fields of `EdgeArrays` as a plain tuple.
         x: (n, B) states.
         inputs: (m, B) inputs as fractions of their limits.
-        period: control period in s.
-        effort: weight of the squared inputs in m^2.
         squares: (N, B) scratch.
         efforts: (N, B) scratch.
         reward: (B, N) overwritten with -period * (mean square error + effort * |u|^2).
         error: (B, N) overwritten with the root mean square error in m.
+        period: control period in s.
+        effort: weight of the squared inputs in m^2.
+        low: first environment.
+        high: one past the last.
     """
-    squares[:] = 0.0
-    efforts[:] = 0.0
+    edges = EdgeArrays(*edges)
+    for i in range(squares.shape[0]):
+        for b in range(high - low):
+            squares[i, place(low + b)] = 0.0
+            efforts[i, place(low + b)] = 0.0
     for edge in range(edges.agent.size):
         agent, weight = edges.agent[edge], edges.weight[edge]
         for c in range(edges.own.shape[1]):
-            for env in range(x.shape[1]):
+            for b in range(high - low):
+                env = place(low + b)
                 miss = x[edges.other[edge, c], env] - x[edges.own[edge, c], env] - edges.displacement[edge, c]
                 squares[agent, env] += weight * miss * miss
     for column in range(edges.input_owner.size):
         owner = edges.input_owner[column]
         if owner >= 0:
-            for env in range(inputs.shape[1]):
+            for b in range(high - low):
+                env = place(low + b)
                 efforts[owner, env] += inputs[column, env] * inputs[column, env]
-    for env in range(reward.shape[0]):
+    for env in range(low, high):
         for i in range(reward.shape[1]):
             reward[env, i] = -period * (squares[i, env] + effort * efforts[i, env])
             error[env, i] = np.sqrt(squares[i, env])
