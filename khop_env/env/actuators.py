@@ -16,8 +16,7 @@ import numpy as np
 from khop_env.observers import FloatArray
 from khop_env.physics import did_you_mean
 
-
-OTHER, DIRECT, LAG, SLEW, HOLD = range(5)
+OTHER, DIRECT, LAG, SLEW, HOLD = range(5)  # of `period.actuate`
 
 
 class Actuator(Protocol):

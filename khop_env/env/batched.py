@@ -16,7 +16,7 @@ from khop_env.env.actions import ActionReader
 from khop_env.env.actuators import OTHER, compiled_form
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.layout import Float32Array, ObservationLayout
-from khop_env.env.options import seeds
+from khop_env.env.options import completed, seeds
 from khop_env.env.period import actuate, as_fractions, end_period, larger_for_all
 from khop_env.env.readout import Sources, summarize
 from khop_env.env.settings import Settings
@@ -165,7 +165,7 @@ class BatchedEnv:
         chosen_seeds = seeds(seed, chosen)
         generators = [self._generator(int(b), own) for b, own in zip(chosen, chosen_seeds, strict=True)]
         if initial_states is not None:
-            initial_states = self._completed(np.asarray(initial_states, dtype=float), generators)
+            initial_states = completed(initial_states, self.simulator.initial, generators)
         self.simulator.reset(generators, initial_states, chosen)
         for b, own, generator in zip(chosen.tolist(), chosen_seeds, generators, strict=True):
             self._generators[b] = generator
@@ -274,25 +274,14 @@ class BatchedEnv:
         return signature(self.task, self.world, self.settings, self.simulator.disturbance, self.simulator.observers)
 
     def _generator(self, b: int, seed: int | None) -> np.random.Generator:
-        own = self._generators[b]
-        if (
-            seed is not None or own is None or not self._seeded[b]
-        ):  # an unseeded one must not repeat draws of the environment it was copied from
+        own = self._generators[b]  # must not repeat the draws of the environment it was copied from, unless seeded
+        if seed is not None or own is None or not self._seeded[b]:
             return np.random.default_rng(seed)
         return own
 
-    def _completed(self, x0: FloatArray, generators: Sequence[np.random.Generator]) -> FloatArray:
-        """Initial states in which nan is replaced by the simulator's draws."""
-        if not np.isnan(x0).any() or x0.shape[-1:] != (self.fleet.n,):
-            return x0
-        drawn = np.array([self.simulator.initial.draw(copy.deepcopy(rng)) for rng in generators])
-        return np.where(np.isnan(x0), drawn, x0)
-
     def _require_running(self, ended: NDArray[np.bool_] | None) -> None:
-        if not self._some_over:
-            return
-        over = np.flatnonzero(self._over if ended is None else self._over & ~ended)
-        if over.size:
+        over = np.flatnonzero(self._over if ended is None else self._over & ~ended) if self._some_over else ()
+        if len(over):
             raise ValueError(
                 f"no episode is running in {len(over)} of {self.num_envs} environments, the first {over[0]}: call "
                 "reset() first"

@@ -78,7 +78,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         }
         self.state_space = state_space(batched)
         self._actions = np.zeros((1, int(batched.action_offset[-1])))
-        self._row, self._shapes = self._actions[0], [space.shape for space in self.action_spaces.values()]
+        self._shapes = [space.shape for space in self.action_spaces.values()]
         self._begun = False
         self._renderer: Renderer | None = None
         if render_mode is not None:
@@ -209,7 +209,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         if actions.keys() != self._entries.keys():
             for agent in actions:  # a wrong name explains the missing ones
                 self._known(agent)
-        flat = self._row
+        flat = self._actions[0]
         for agent, part in self._entries.items():
             if agent not in actions:
                 missing = [known for known in self.agents if known not in actions]
@@ -233,7 +233,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             values = [actions[agent] for agent in self.possible_agents]
             if [value.shape for value in values] != self._shapes:
                 return False
-            np.concatenate(values, out=self._row)
+            np.concatenate(values, out=self._actions[0])
         except Exception:  # whatever it is, a look at one action after the other finds it
             return False
         return True

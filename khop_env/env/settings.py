@@ -78,12 +78,12 @@ class Settings:
                 raise ValueError(f"{name} must be True or False; got {getattr(self, name)!r}")
         for name in ("max_cycles", "order", "threads"):
             value = getattr(self, name)
-            if (value is None and name == "max_cycles") or (name == "threads" and _is_auto(value)):
+            if (value is None and name == "max_cycles") or (name == "threads" and value == "auto"):
                 continue
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 other = " or 'auto'" if name == "threads" else ""
                 raise ValueError(f"{name} must be a positive integer{other}; got {value!r}")
-        if not _is_auto(self.threads) and self.threads > MOST_THREADS:
+        if isinstance(self.threads, int | np.integer) and self.threads > MOST_THREADS:
             raise ValueError(f"threads must be at most {MOST_THREADS}; got {self.threads!r}")
         size = self.message_size
         if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 0 <= size <= MOST_DATA:
@@ -142,7 +142,7 @@ class Settings:
 
     def threads_for(self, num_envs: int) -> int:
         """Number of threads for a batch of so many environments: `threads`, or what "auto" means for it."""
-        if _is_auto(self.threads):
+        if self.threads == "auto":
             return max(1, min(processors(), num_envs // FEWEST, MOST_THREADS))
         return int(self.threads)
 
@@ -150,10 +150,6 @@ class Settings:
     def inputs_are_states(self) -> bool:
         """True if the actuator remembers its input, which agents then observe."""
         return not isinstance(self.actuator, Direct)
-
-
-def _is_auto(threads: object) -> bool:
-    return isinstance(threads, str) and threads == "auto"
 
 
 class SettingsArguments(TypedDict, total=False):

@@ -84,13 +84,13 @@ class EdgeTask(Task):
         super().bind(world)
         self.edges, self.displacement = self.relations(world)
         fleet, members = world.fleet, list(self.acting(world))
-        number = {agent: place for place, agent in enumerate(members)}
+        number = {agent: order for order, agent in enumerate(members)}
         counted = np.array([i in number for i in self.edges[:, 0].tolist()], bool)
         edges, position = self.edges[counted], fleet.position_index
         agent = np.array([number[i] for i in edges[:, 0].tolist()], np.int64)
         input_owner = np.full(fleet.m, -1, np.int64)
-        for place, i in enumerate(members):
-            input_owner[fleet.input_slice(i)] = place
+        for i, owner in number.items():
+            input_owner[fleet.input_slice(i)] = owner
         arrays = EdgeArrays(
             agent,
             np.ascontiguousarray(position[edges[:, 0]]),
@@ -120,7 +120,7 @@ class EdgeTask(Task):
         """See the class; "task_error" is the root mean square error along the agent's own edges in m."""
         shape = world.num_envs, len(self._squares)
         reward, error = np.empty(shape), np.empty(shape)
-        period, effort = world.control_period, float(self.effort)
+        period, effort = float(world.control_period), float(self.effort)
         arrays = self._arrays, world.x, world.inputs, self._squares, self._efforts, reward, error
         world.each(lambda low, high: evaluate_edges(*arrays, period, effort, low, high))
         if self.reward == "team":
