@@ -11,6 +11,8 @@ from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import Fleet
 
+_TILE = 32  # environments whose actions are read together
+
 
 class ActionReader:
     """Reads the actions of all acting agents, side by side.
@@ -123,20 +125,17 @@ def read_actions(
     """
     for env in range(actions.shape[0]):
         for q in range(entry.size):
-            value = actions[env, entry[q]]
-            if not np.isfinite(value):
+            if not np.isfinite(actions[env, entry[q]]):
                 return env * entry.size + q
-    for env in range(actions.shape[0]):
+    for first in range(0, actions.shape[0], _TILE):
+        last = min(first + _TILE, actions.shape[0])
         for q in range(entry.size):
-            value = actions[env, entry[q]]
-            if value > 1.0:
-                value = 1.0
-                clipped[env, owner[q]] += 1
-            elif value < -1.0:
-                value = -1.0
-                clipped[env, owner[q]] += 1
-            if q < column.size:
-                command[column[q], env] = value
-            else:
-                said[row[q - column.size], env] = value
+            for env in range(first, last):
+                value = actions[env, entry[q]]
+                inside = min(max(value, -1.0), 1.0)
+                clipped[env, owner[q]] += inside != value
+                if q < column.size:
+                    command[column[q], env] = inside
+                else:
+                    said[row[q - column.size], env] = inside
     return -1

@@ -280,8 +280,7 @@ class BatchedEnv:
         return own
 
     def _require_running(self, ended: NDArray[np.bool_] | None) -> None:
-        over = np.flatnonzero(self._over if ended is None else self._over & ~ended) if self._some_over else ()
-        if len(over):
+        if self._some_over and (over := np.flatnonzero(self._over if ended is None else self._over & ~ended)).size:
             raise ValueError(
                 f"no episode is running in {len(over)} of {self.num_envs} environments, the first {over[0]}: call "
                 "reset() first"
@@ -330,7 +329,7 @@ class BatchedEnv:
                 summarize(*information, state.t, sources.known, self.settings.control_period, low, high)
             readout.write(sources, flat, clipped, low, high)
 
-        self.world.each(write)
+        self.world.each(write, readout.size)
         if self.settings.uniform:
             return flat.reshape(self.num_envs, len(self.agents), -1), clipped
         return flat, clipped
@@ -339,8 +338,7 @@ class BatchedEnv:
         observations, clipped = self._observe()
         extremes = self.simulator.running_extremes
         normalized, relative = (np.empty((self.num_envs, len(self.agents))) for _ in range(2))
-        larger_for_all(extremes.normalized, extremes.input_normalized, normalized)
-        larger_for_all(extremes.relative, extremes.input_relative, relative)
+        larger_for_all(tuple(extremes), normalized, relative)
         return observations, {
             **outcome.infos,
             "max_normalized_disagreement": normalized,

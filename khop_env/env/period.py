@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.compiled import compiled
 from khop_env.env.actuators import DIRECT, HOLD, LAG, SLEW
-from khop_env.observers import FloatArray, IntArray
+from khop_env.observers import Extremes, FloatArray, IntArray
 
 
 @compiled
@@ -70,10 +72,17 @@ def end_period(
 
 
 @compiled
-def larger_for_all(of_states: FloatArray, of_inputs: FloatArray, out: FloatArray) -> None:
-    """Write the larger of two ratios (B,) for all agents of an environment into `out` (B, N); NaN if one is."""
-    for env in range(out.shape[0]):
-        first, second = of_states[env], of_inputs[env]
-        value = first if first >= second or first != first else second
-        for i in range(out.shape[1]):
-            out[env, i] = value
+def larger_for_all(extremes: Any, normalized: FloatArray, relative: FloatArray) -> None:
+    """Write the larger ratio, that of states or that of inputs, for all agents; NaN if one is.
+
+    Args:
+        extremes: the fields of `observers.Extremes` as a plain tuple, (B,) each.
+        normalized: (B, N) overwritten.
+        relative: (B, N) overwritten.
+    """
+    extremes = Extremes(*extremes)
+    for env in range(normalized.shape[0]):
+        first, second = extremes.normalized[env], extremes.input_normalized[env]
+        normalized[env] = first if first >= second or first != first else second
+        first, second = extremes.relative[env], extremes.input_relative[env]
+        relative[env] = first if first >= second or first != first else second

@@ -93,6 +93,7 @@ class Readout:
     Attributes:
         template: (columns,) the constants.
         uses_bounds: whether any column reads guaranteed bounds.
+        size: number of columns that aren't constant.
         task_rows: rows of the task's live columns.
     """
 
@@ -113,7 +114,7 @@ class Readout:
             np.ascontiguousarray(bounds[:, 1]),
         )
         self._live: Any = tuple(live_columns)  # Numba recognises the types of a plain tuple more quickly
-        self.uses_bounds = BOUND in kinds
+        self.uses_bounds, self.size = BOUND in kinds, len(live)
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
     def empty(self, num_envs: int) -> Float32Array:

@@ -14,9 +14,9 @@ from khop_env.observers import Estimator, as_estimator
 from khop_env.observers.proximal import MOST_THREADS
 from khop_env.physics import or_did_you_mean
 from khop_env.simulation import OBSERVE, Observe
-from khop_env.tasks.base import FEWEST
 from khop_env.threads import processors
 
+FEWEST = 64  # environments for each thread of threads="auto"
 MOST_DATA = 1000  # numbers of a policy in a message
 NUMBER = (int, float, np.integer, np.floating)
 

@@ -23,8 +23,8 @@ from khop_env.physics import Fleet
 from khop_env.simulation import InitialSet
 from khop_env.threads import Threads
 
-FEWEST = 64
-"""Environments that are worth a thread: fewer take less time than it takes to start one, about 30 us."""
+WORTH_A_THREAD = 60_000
+"""Numbers that a thread has to compute to be worth its start: they take 60 to 100 us, starting it about 30."""
 
 Signature = dict[str, tuple[str, ...]]
 """Properties in words, by a plural noun, which two environments must have in common to exchange states."""
@@ -64,20 +64,19 @@ class World:
 
     __repr__ = brief
 
-    def __post_init__(self) -> None:
-        self._ranges = self.threads.ranges(self.num_envs, FEWEST)
-
-    def each(self, function: Callable[[int, int], object]) -> None:
+    def each(self, function: Callable[[int, int], object], numbers: int) -> None:
         """Call `function(low, high)` with ranges of environments, which together are all, in the threads.
 
         Args:
             function: compiled code, which doesn't hold the GIL, or NumPy's on many environments; what it writes for an
                 environment must not depend on the range.
+            numbers: about how many it computes for an environment; a sine counts as ten.
         """
-        if len(self._ranges) == 1:
+        if self.threads.count == 1 or self.num_envs * numbers < 2 * WORTH_A_THREAD:
             function(0, self.num_envs)
         else:
-            self.threads.run(lambda part: function(*part), self._ranges)
+            ranges = self.threads.ranges(self.num_envs, -(-WORTH_A_THREAD // max(1, numbers)))
+            self.threads.run(lambda part: function(*part), ranges)
 
     @property
     def fleet(self) -> Fleet:

@@ -16,6 +16,7 @@ from khop_env.tasks.base import Column, Outcome, Signature, Task, World
 
 Reward = Literal["agent", "team"]
 NUMBER = (int, float, np.integer, np.floating)
+_TILE = 32  # environments whose rewards are written together
 
 
 class EdgeArguments(TypedDict, total=False):
@@ -100,6 +101,7 @@ class EdgeTask(Task):
             input_owner,
         )
         self._arrays: Any = tuple(arrays)  # Numba recognises the types of a plain tuple more quickly
+        self._numbers = arrays.own.size + fleet.m + len(members)
         self._period = world.control_period
         self._squares = np.zeros((len(members), world.num_envs))
         self._efforts = np.zeros((len(members), world.num_envs))
@@ -122,7 +124,7 @@ class EdgeTask(Task):
         reward, error = np.empty(shape), np.empty(shape)
         period, effort = float(world.control_period), float(self.effort)
         arrays = self._arrays, world.x, world.inputs, self._squares, self._efforts, reward, error
-        world.each(lambda low, high: evaluate_edges(*arrays, period, effort, low, high))
+        world.each(lambda low, high: evaluate_edges(*arrays, period, effort, low, high), self._numbers)
         if self.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
         terminated = np.zeros(world.num_envs, bool)
@@ -219,7 +221,8 @@ def evaluate_edges(
             for b in range(high - low):
                 env = place(low + b)
                 efforts[owner, env] += inputs[column, env] * inputs[column, env]
-    for env in range(low, high):
+    for first in range(low, high, _TILE):
         for i in range(reward.shape[1]):
-            reward[env, i] = -period * (squares[i, env] + effort * efforts[i, env])
-            error[env, i] = np.sqrt(squares[i, env])
+            for env in range(first, min(first + _TILE, high)):
+                reward[env, i] = -period * (squares[i, env] + effort * efforts[i, env])
+                error[env, i] = np.sqrt(squares[i, env])

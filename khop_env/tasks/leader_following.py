@@ -116,7 +116,7 @@ class LeaderFollowing(EdgeTask):
                 own, wanted = states[low:high, fleet.state_slice(i)], velocity[low:high, number]
                 inputs[low:high, fleet.input_slice(i)] = velocity_to_input(fleet.models[i], own, wanted)
 
-        world.each(write)
+        world.each(write, velocity[0].size * 20 * (1 + SINES))
 
     def signature(self, world: World) -> Signature:
         """Leaders with their speeds, edges and displacements."""

@@ -100,6 +100,7 @@ class Navigation(Task):
             "reached": np.zeros((len(fleet), world.num_envs)),  # 1 if it had arrived before this control period
         }
         self._input_owner = np.repeat(np.arange(len(fleet)), [model.m for model in fleet.models])
+        self._numbers = len(fleet) * (len(fleet) * fleet.position_dim + 20 * len(self._obstacles))  # in `moved`
         self._after, self._effort = np.zeros(shape), np.zeros((len(fleet), world.num_envs))
 
     def columns(self, world: World, agent: int) -> Sequence[Column]:
@@ -114,7 +115,7 @@ class Navigation(Task):
     def observe(self, world: World, out: FloatArray) -> None:
         """Fill these columns."""
         arrays = world.fleet.position_index, world.x, self.memory["goal"], self._obstacles, out
-        world.each(lambda low, high: observe_goals(*arrays, low, high))
+        world.each(lambda low, high: observe_goals(*arrays, low, high), len(out) * 5)
 
     def reset(self, world: World, env_ids: IntArray, rngs: Sequence[np.random.Generator]) -> None:
         """Draw the goals."""
@@ -138,7 +139,7 @@ class Navigation(Task):
         memory, index, x = self._arrays(), world.fleet.position_index, world.x
         first, radius, limit = number == 0, float(self.goal_radius), float(world.limit)
         arrays = memory, index, x, self._obstacles, self._after
-        world.each(lambda low, high: follow_motion(*arrays, first, radius, limit, low, high))
+        world.each(lambda low, high: follow_motion(*arrays, first, radius, limit, low, high), self._numbers)
 
     def _arrays(self) -> Any:
         """The memory for compiled loops."""
@@ -155,7 +156,9 @@ class Navigation(Task):
         weights = float(world.control_period * self.effort), float(self.bonus), float(self.penalty)
         sizes = float(self.goal_radius), float(self.arena.radius)
         ends = self.end_at_collision
-        world.each(lambda low, high: evaluate_goals(*arrays, *results, weights, sizes, ends, low, high))
+        world.each(
+            lambda low, high: evaluate_goals(*arrays, *results, weights, sizes, ends, low, high), 10 * len(self._effort)
+        )
         if self.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
         return Outcome(reward, terminated, infos)
