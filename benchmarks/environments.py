@@ -112,15 +112,15 @@ def environment_rows(report: Report, quick: bool, say: Callable[[str], None], pe
             for part, value in shares(env, step, 3 if quick else steps).items():
                 add(f"{kind}_{scenario}: {part}", value, "us per copy and step")
 
-    threads = {
-        name: tuple(batched(scenario, 1, count, batch, environment, **arguments)[1] for count in (1, 2))
-        for name, environment, scenario, arguments in (
-            ("threads_paper", "consensus_v0", "paper", {}),
-            ("threads_convoy", "leader_following_v0", "convoy", {}),
-            ("threads_paper_wifi", "consensus_v0", "paper", {"network": "wifi"}),
-        )
+    def step_of(count: int, environment: str, scenario: str, **arguments: Any) -> Callable[[int], None]:
+        return batched(scenario, 1, count, batch, environment, **arguments)[1]
+
+    cases: dict[str, Callable[[int], Callable[[int], None]]] = {
+        "threads_paper": lambda count: step_of(count, "consensus_v0", "paper"),
+        "threads_convoy": lambda count: step_of(count, "leader_following_v0", "convoy"),
+        "threads_paper_wifi": lambda count: step_of(count, "consensus_v0", "paper", network="wifi"),
     }
-    thread_rows(report, threads, seconds / 2.0, 1 if quick else TURNS, say)
+    thread_rows(report, cases, seconds / 2.0, 1 if quick else TURNS, say)
 
     def ours(scenario: str, order: int, threads: int) -> Rate:
         return lambda s: vector_rate(s, scenario, order, threads, batch)

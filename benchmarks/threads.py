@@ -17,19 +17,20 @@ ROOTS = 500_000  # in the plain loop, some ms
 
 
 def thread_rows(
-    report: Report, cases: dict[str, tuple[Step, Step]], seconds: float, turns: int, say: Callable[[str], None]
+    report: Report, cases: dict[str, Callable[[int], Step]], seconds: float, turns: int, say: Callable[[str], None]
 ) -> None:
     """Add the gain of the second thread in each case, and in a plain loop, medians over turns of both.
 
     Args:
         report: takes the rows.
-        cases: by name of the row the same step in one thread and in two.
+        cases: by name of the row, a step in so many threads as are asked for.
         seconds: to measure a rate.
         turns: number of alternating measurements.
         say: called with a line before each row.
     """
-    for name, (one, two) in cases.items():
+    for name, step_of in cases.items():
         say(f"environments: {name}")
+        one, two = step_of(1), step_of(2)
         gains: list[float] = []
         plain: list[float] = []
         for _ in range(turns):
