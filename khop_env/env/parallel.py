@@ -138,7 +138,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         agents = self.possible_agents
         return (
             self._by_agent(observations),
-            dict(zip(agents, reward[0].tolist(), strict=True)),
+            dict(zip(agents, reward.tolist()[0])),  # noqa: B905 -- strict costs time, at every step
             dict.fromkeys(agents, terminated.item()),
             dict.fromkeys(agents, truncated.item()),
             self._infos(infos),
@@ -240,7 +240,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
 
     def _by_agent(self, observations: Float32Array) -> dict[str, Float32Array]:
         if observations.ndim == 3:
-            return dict(zip(self._columns, observations[0], strict=True))
+            return dict(zip(self.possible_agents, observations[0]))  # noqa: B905
         flat = observations[0]
         return {agent: flat[part] for agent, part in self._columns.items()}
 
@@ -262,8 +262,8 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
                 warnings.warn(f"the window isn't drawn: {error}", RuntimeWarning, stacklevel=3)
 
     def _infos(self, infos: Infos) -> dict[str, dict[str, float]]:
-        rows = zip(*[values[0].tolist() for values in infos.values()], strict=True)
-        return dict(zip(self._columns, map(dict, map(zip, itertools.repeat(tuple(infos)), rows)), strict=True))
+        rows = zip(*[values.tolist()[0] for values in infos.values()])  # noqa: B905
+        return dict(zip(self.possible_agents, map(dict, map(zip, itertools.repeat(tuple(infos)), rows))))  # noqa: B905
 
     def _remember(self, *, begins: bool) -> None:
         """Add to the trails, or begin new ones, so that frames show the whole path however seldom they are drawn."""

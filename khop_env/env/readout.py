@@ -70,19 +70,6 @@ class Sources(NamedTuple):
     data: FloatArray
 
 
-class _LiveColumns(NamedTuple):
-    """Arrays over the columns that aren't constant, with the attributes of `Column`."""
-
-    column: IntArray
-    kind: IntArray
-    row: IntArray
-    origin: IntArray
-    gate: IntArray
-    owner: IntArray
-    low: FloatArray
-    high: FloatArray
-
-
 class Readout:
     """Fills (B, columns) vectors; every value lies within its field's bounds.
 
@@ -103,17 +90,10 @@ class Readout:
         kinds, rows = [columns[q].kind for q in live], [columns[q].row for q in live]
         # float32 bounds, so that values clipped to them in float64 are inside them as float32, too
         bounds = np.array([columns[q].bounds for q in live], np.float32).reshape(-1, 2).astype(float)
-        live_columns = _LiveColumns(
-            np.array(live, np.int64),
-            np.array(kinds, np.int64),
-            np.array(rows, np.int64),
-            np.array([columns[q].origin for q in live], np.int64),
-            np.array([columns[q].gate for q in live], np.int64),
-            np.array([owner[q] for q in live], np.int64),
-            np.ascontiguousarray(bounds[:, 0]),
-            np.ascontiguousarray(bounds[:, 1]),
-        )
-        self._live: Any = tuple(live_columns)  # Numba recognises the types of a plain tuple more quickly
+        owners = [owner[q] for q in live]
+        origins, gates = ([getattr(columns[q], name) for q in live] for name in ("origin", "gate"))
+        self._live = np.array([live, kinds, rows, origins, gates, owners], np.int64)
+        self._bounds = np.ascontiguousarray(bounds.T)
         self.uses_bounds, self.size = BOUND in kinds, len(live)
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
@@ -131,28 +111,49 @@ class Readout:
             low: first environment.
             high: one past the last.
         """
-        fill(self._live, self.template, tuple(sources), out, clipped, low, high)
+        fill(self._live, self._bounds, self.template, tuple(sources), out, clipped, low, high)
 
 
 @compiled
 def fill(
-    live: Any, template: Float32Array, sources: Any, out: Float32Array, clipped: IntArray, low: int, high: int
+    live: IntArray,
+    bounds: FloatArray,
+    template: Float32Array,
+    sources: Any,
+    out: Float32Array,
+    clipped: IntArray,
+    low: int,
+    high: int,
 ) -> None:
-    """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner.
+    """Write `template` and the live columns, C of them, into `out`; count values out of bounds per owner.
 
-    `live` and `sources` are the fields of `_LiveColumns` and `Sources` as plain tuples; only environments `low` to
-    `high` are written.
+    Args:
+        live: (6, C) where each column stands in `out`, then its kind, row, origin, gate and owner, as in `Column`.
+        bounds: (2, C) its smallest and largest value.
+        template: (columns,) the constants.
+        sources: the fields of `Sources` as a plain tuple, which Numba recognises more quickly.
+        out: (B, columns) overwritten.
+        clipped: (B, owners) added to.
+        low: first environment.
+        high: one past the last.
     """
-    live, sources = _LiveColumns(*live), Sources(*sources)
+    sources = Sources(*sources)
     x, estimate = sources.x, sources.estimate
     values = np.empty(_TILE)
     for first in range(low, high, _TILE):
         width = min(_TILE, high - first)
         for e in range(width):
             out[first + e] = template
-        for q in range(live.column.size):
-            column, kind, row, origin, owner = live.column[q], live.kind[q], live.row[q], live.origin[q], live.owner[q]
-            least, most = live.low[q], live.high[q]
+        for q in range(live.shape[1]):
+            column, kind, row, origin, gate, owner = (
+                live[0, q],
+                live[1, q],
+                live[2, q],
+                live[3, q],
+                live[4, q],
+                live[5, q],
+            )
+            least, most = bounds[0, q], bounds[1, q]
             if kind == STATE_RELATIVE:
                 for e in range(width):
                     values[e] = x[row, first + e] - x[origin, first + e]
@@ -193,7 +194,6 @@ def fill(
             else:
                 for e in range(width):
                     values[e] = np.sin(estimate[row, first + e])
-            gate = live.gate[q]
             if gate >= 0:
                 for e in range(width):
                     values[e] = values[e] * sources.known[gate, first + e] + 0.0  # no -0.0, whose sign would tell
