@@ -13,8 +13,9 @@ import numpy as np
 from benchmarks.comparison import compare, run_peer
 from benchmarks.report import Report
 from benchmarks.threads import thread_rows
-from khop_env import consensus_v0, make_batched
+from khop_env import consensus_v0
 from khop_env.env import BatchedEnv, KHopEnv, Settings
+from khop_env.registry import make_batched
 
 BATCH = 1024
 TURNS = 5  # repetitions of both sides of a ratio
