@@ -2,6 +2,7 @@
 
 import math
 import re
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -193,6 +194,32 @@ def test_unknown_agents_have_no_spaces():
             method("driftr_1")
         with pytest.raises(ValueError, match="no agent 'drifter_0'; it is a leader, which takes no part"):
             method("drifter_0")
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda actions: dict(reversed(actions.items())),
+        lambda actions: MappingProxyType(actions),
+        lambda actions: {agent: action.tolist() for agent, action in actions.items()},
+        lambda actions: {agent: action.astype(object) for agent, action in actions.items()},
+        lambda actions: {agent: action.astype(np.int8) for agent, action in actions.items()},
+        lambda actions: {agent: action.astype(str) for agent, action in actions.items()},
+    ],
+)
+def test_actions_in_any_form_are_the_same(form):
+    """In another order, in another mapping, and as other numbers; -1, 0 and 1 are exact in all of them."""
+    seen = []
+    for change in (dict, form):
+        env = parallel("consensus_v0")
+        env.reset(seed=3)
+        rng = np.random.default_rng(0)
+        for _ in range(3):
+            actions = {agent: rng.integers(-1, 2, 2).astype(np.float32) for agent in env.agents}
+            result = env.step(change(actions))
+        seen.append(result)
+    assert same(*seen)
+    assert env.batched.world.inputs.any()
 
 
 WRONG_SETTINGS = {
