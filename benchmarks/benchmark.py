@@ -123,7 +123,7 @@ def benchmark(
         Part(
             "environments",
             "environments",
-            0.5 if peers is None else 3.0,
+            0.9 if peers is None else 3.4,
             partial(environment_rows, report, quick, say, peers),
         ),
         Part(

@@ -121,7 +121,7 @@ def make_batched(
     chosen = _chosen_scenario(task.default_scenario if scenario is None else scenario)
     if isinstance(task, type):
         task = task(**{name: value for name, value in arguments.items() if name in of_task})
-    settings, observers = _observers_of(settings, chosen)
+    settings, observers = _observers_of(settings, chosen, int(num_envs))
     if settings.max_cycles is None:
         cycles = max(1, math.ceil(chosen.duration / settings.control_period - 1e-9))
         settings = dataclasses.replace(settings, max_cycles=cycles)
@@ -292,7 +292,7 @@ def _defaults(settings: type[Settings]) -> dict[str, Any]:
     return {field.name: field.default for field in dataclasses.fields(settings)}
 
 
-def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Observers]:
+def _observers_of(settings: Settings, scenario: Scenario, num_envs: int) -> tuple[Settings, Observers]:
     """The observers, and the settings with the scenario's network and estimator where none are chosen."""
     network = Network.of(scenario.network if settings.network is None else settings.network)
     if network is None:
@@ -307,7 +307,7 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
                 f"message_size={settings.message_size}: without a network there are no messages: choose one, e.g. "
                 "network='wifi'"
             )
-        return dataclasses.replace(settings, network=None), Proximal(settings.order, settings.threads)
+        return dataclasses.replace(settings, network=None), Proximal(settings.order, settings.threads_for(num_envs))
     if settings.order != 1:
         raise ValueError(
             f"order={settings.order} is of simulators without a network; under one steps are of order 1: leave it out, "

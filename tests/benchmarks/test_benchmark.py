@@ -73,6 +73,8 @@ def test_every_promised_figure_is_printed():
     } <= set(rows)
     assert rows.pop("violations") == rows.pop("collisions_certified") == 0
     assert {f"filter_{place}_{how}" for place in ("apart", "crowd") for how in ("single", "batch")} <= set(rows)
+    threads = {"threads_paper", "threads_convoy", "threads_paper_wifi"}
+    assert threads | {f"{name}_plain" for name in threads} <= set(rows)
     assert PARTS | RATES | {"environment_control_period", "environment_substeps"} <= set(rows)
     assert {f"{kind}_making_1000" for kind in ("environment", "wifi")} <= set(rows)
     assert (rows["environment_control_period"], rows["environment_substeps"]) == (0.05, 1)
