@@ -313,7 +313,7 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
         )
     estimator = settings.estimator or scenario.estimator
     chosen = dataclasses.replace(settings, network=network, estimator=estimator)
-    return chosen, Networked(network, estimator, settings.message_size)
+    return chosen, Networked(network, estimator, settings.message_size, settings.threads)
 
 
 def _chosen_scenario(scenario_or_name: Scenario | str | Path) -> Scenario:

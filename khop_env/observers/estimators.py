@@ -12,6 +12,7 @@ from khop_env.network import Network
 from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.layout import FloatArray, IntArray
+from khop_env.threads import Range
 
 Take: TypeAlias = Callable[[IntArray, IntArray, FloatArray], None]
 """take(link (C,), row (C,), held (C, B)): copy into `held` what has just come over links, from rows of what is sent."""
@@ -99,8 +100,8 @@ class Relay:
         """Nothing more."""
         return []
 
-    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_]) -> None:
+    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
         """Nothing to do."""
 
-    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+    def raise_extremes(self, state: PlantState, extremes: Extremes, part: Range | None = None) -> None:
         """No ratios."""

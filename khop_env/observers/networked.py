@@ -9,9 +9,10 @@ adds what it wants to send, and estimates inside the boxes.
 from __future__ import annotations
 
 import copy
+import functools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +20,21 @@ from numpy.typing import NDArray
 from khop_env.network import Channel, Network
 from khop_env.observers.base import Assumptions, Certified, Extremes, Information, Memory, Observers, Plant, PlantState
 from khop_env.observers.certificate import Certificate
-from khop_env.observers.certified import report
+from khop_env.observers.certified import ages, report
 from khop_env.observers.design import ObserverDesign
-from khop_env.observers.estimators import Estimator
+from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.known_estimators import as_estimator, require_memory, require_own_names
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, largest_share, merge
+from khop_env.observers.proximal import MOST_THREADS
 from khop_env.observers.reckoning import Reckoning
+from khop_env.observers.rounds import Rounds
+from khop_env.observers.solve import LANES
 from khop_env.physics import AgentModel, hops_from_targets
+from khop_env.threads import Range, Threads
 
 _CHANNEL = "channel."
+T = TypeVar("T")
 
 
 class Networked:
@@ -44,6 +50,8 @@ class Networked:
         estimator: a name of `ESTIMATORS`, or an `Estimator`.
         message_size: numbers that each agent's policy adds to its message. They are stored and forwarded with its
             state: the memory `said` (N * message_size, B) is sent, `data` (pairs * message_size, B) has arrived.
+        threads: number of threads that share the environments; results don't depend on it. An estimator of your own
+            is called with all of them at once, on one thread.
 
     Attributes:
         network: a `Network`.
@@ -52,7 +60,7 @@ class Networked:
         uncertified: agents whose state has no bound in some component, by index, and why; once prepared.
 
     Raises:
-        ValueError: for an unknown network or estimator.
+        ValueError: for an unknown network or estimator, or if threads is out of range.
     """
 
     name = "networked"
@@ -65,11 +73,15 @@ class Networked:
         network: Network | Mapping[str, object] | str,
         estimator: str | Estimator = "ppso",
         message_size: int = 0,
+        threads: int = 1,
     ) -> None:
         found = Network.of(network)
         if found is None:
             raise ValueError("Networked needs a network, e.g. 'wifi'; without one states are exchanged continuously")
         self.network, self.estimator, self.message_size = found, as_estimator(estimator), message_size
+        if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or not 1 <= threads <= MOST_THREADS:
+            raise ValueError(f"threads must be an integer from 1 to {MOST_THREADS}; got {threads!r}")
+        self.threads = int(threads)
 
     def __repr__(self) -> str:
         return f"Networked({self.network.described()}; {self.estimator.name})"
@@ -88,6 +100,9 @@ class Networked:
         regions = np.concatenate([each.region for each in received])
         self._region = regions[layout.column_source]
         self.estimator = copy.copy(self.estimator)  # its buffers are this object's own
+        # a class derived from the library's may do other things, which may not be divided
+        own: Any = self.estimator if type(self.estimator) in (Rounds, Relay) else None
+        self._by_parts: Rounds | Relay | None = own
         shared = 1 + fleet.n + 2 * (layout.size + layout.pairs) + self.message_size * (len(fleet) + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         require_memory(self.estimator, sources.components)
@@ -96,7 +111,10 @@ class Networked:
         self._up = np.ones((len(design.links), num_envs), np.bool_)
         self._of_memory = [(name, _CHANNEL + name) for name in self.channel.allocate()]
         self._lag = np.zeros((layout.pairs, num_envs))
+        self._noisy = np.zeros((fleet.n if self.network.noise else 0, num_envs))
         self._fastest = self._fewest_rounds()
+        self._threads = Threads(self.threads)
+        self._ranges = self._threads.ranges(num_envs, LANES)
 
     def allocate(self) -> Memory:
         """Predictions from what was received, its stamps and ways, the estimates, their bounds; channel; estimator."""
@@ -132,15 +150,17 @@ class Networked:
             memory[name][:, env_ids] = -1.0
         for name in ("hops", "input_estimate", "said", "data", "step", "even_since"):
             memory[name][..., env_ids] = 0.0
-        self.channel.reset(self._of_channel(memory), env_ids, rngs)
-        heard = memory[_CHANNEL + "heard"].copy()
+        channel = self._of_channel(memory)
+        self.channel.reset(channel, env_ids, rngs)
+        heard = channel["heard"].copy()
         self.estimator.reset(memory, env_ids, first_guess)
         due = np.zeros(self.num_envs, np.bool_)
         due[env_ids] = True
-        self._begin_round(state, due)
-        self._send(state, due)
-        np.copyto(memory[_CHANNEL + "heard"], heard, where=~due)  # the others' last round is as it was
-        self._report(state)
+        up = self.links_up(state)
+        self._run(lambda part: self._begin_round(channel, state, up, due, part))
+        self._exchange(channel, state, due)
+        np.copyto(channel["heard"], heard, where=~due)  # the others' last round is as it was
+        self._run(lambda part: self._report(memory, part))
 
     def advance(self, plant: Plant, before: PlantState, state: PlantState, dt: float) -> None:
         """Advance `state`, a copy of `before`, by `dt` seconds, and run the round that is due then, if any.
@@ -151,25 +171,39 @@ class Networked:
         memory = state.memory
         plant.stage(0, np.array([dt]), dt, before, state)  # first: nothing has changed yet if it raises
         plant.effect(state)
-        due = self.channel.due(self._of_channel(memory), state.t)
-        self._begin_round(state, due)
+        channel = self._of_channel(memory)
+        due, up = self.channel.due(channel, state.t), self.links_up(state)
         rounds = bool(due.any())
         changed = np.abs(memory["step"] - dt) > 1e-9 * dt
         np.copyto(memory["even_since"], before.t, where=changed)
         memory["step"].fill(dt)
-        if rounds and self.network.most_rounds_late:
-            # as if these messages had arrived at the last grid point, and what they say had been moved from there
-            self._merge(True, state, before.t, dt)
+
+        def begin(part: Range) -> bool:
+            self._begin_round(channel, state, up, due, part)
+            # as if late messages had arrived at the last grid point, and what they say had been moved from there
+            late = rounds and self.network.most_rounds_late > 0
+            return late and self._merge(channel, state, before.t, part, late=True)
+
+        if any(self._run(begin)):
+            self._reckoning.catch_up(memory["center"], memory["error"], before.t, self._lag, dt)
         self.estimator.predict(memory, before.t, dt)
-        self._reckoning.advance(memory["center"], memory["error"], before.t, dt)
+        self._reckoning.rates(memory["center"], before.t)
+
+        def move(part: Range) -> None:
+            self._reckoning.advance(memory["center"], memory["error"], dt, part)
+            if not rounds:
+                self._report(memory, part)
+
         if rounds:
-            self._send(state, due)
-        self._report(state)
+            self._exchange(channel, state, due, move, lambda part: self._report(memory, part))
+        else:
+            self._run(move)
         plant.actuate(state)
 
     def bound(self, state: PlantState, out: FloatArray) -> Certified:
         """The certified bound: the distance from each estimate to the farther face of its box; inf without one."""
-        np.copyto(out, state.memory["bound"])
+        bound = state.memory["bound"]
+        self._run(lambda part: np.copyto(out[:, slice(*part)], bound[:, slice(*part)]))
         return Certified(out, "certificate")
 
     def links_up(self, state: PlantState) -> NDArray[np.bool_] | None:
@@ -181,8 +215,8 @@ class Networked:
     def information(self, state: PlantState) -> Information:
         """Age, way and time of arrival of the newest state that each pair has received."""
         stamp, arrived = state.memory["stamp"], state.memory["arrived"]
-        nothing = stamp < 0.0
-        age, since = (np.where(nothing, math.inf, state.t - values) for values in (stamp, arrived))
+        age, since = np.empty(stamp.shape), np.empty(stamp.shape)
+        self._run(lambda part: ages(state.t, stamp, arrived, age, since, *part))
         return Information(age, state.memory["hops"], since)
 
     def limits(self, state: PlantState, out: FloatArray) -> FloatArray:
@@ -208,46 +242,97 @@ class Networked:
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
         """Raise running maxima: errors over certified bounds, and the estimator's own |xi| / rho."""
-        largest_share(
-            self.layout.column_source, state.memory["estimate"], state.x, state.memory["bound"], extremes.relative
-        )
-        self.estimator.raise_extremes(state, extremes)
+        source, memory = self.layout.column_source, state.memory
+
+        def raised(part: Range) -> None:
+            largest_share(source, memory["estimate"], state.x, memory["bound"], extremes.relative, *part)
+            if self._by_parts is not None:
+                self._by_parts.raise_extremes(state, extremes, part)
+
+        self._run(raised)
+        if self._by_parts is None:
+            self.estimator.raise_extremes(state, extremes)
 
     # -- parts ---------------------------------------------------------------------------------------------------
 
     def _of_channel(self, memory: Memory) -> Memory:
         return {name: memory[key] for name, key in self._of_memory}
 
-    def _begin_round(self, state: PlantState, due: NDArray[np.bool_]) -> None:
-        """Measure what is to be sent, and decide what is lost and what arrives."""
-        channel = self._of_channel(state.memory)
-        self._measured = self.channel.measured(channel, state.x)
-        self.channel.begin_round(channel, self.links_up(state), due)
+    def _run(self, work: Callable[[Range], T]) -> list[T]:
+        """Results of `work` on all environments, a range for each thread."""
+        return self._threads.run(work, self._ranges)
 
-    def _send(self, state: PlantState, due: NDArray[np.bool_]) -> None:
-        """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived."""
-        memory, channel = state.memory, self._of_channel(state.memory)
-        shared = [state.t[None], self._measured]
-        shared += [memory[name] for name in ("center", "error", "stamp", "hops", "said", "data")]
-        added = self.estimator.message(state)
+    def _begin_round(
+        self, channel: Memory, state: PlantState, up: NDArray[np.bool_] | None, due: NDArray[np.bool_], part: Range
+    ) -> None:
+        """Measure what is to be sent, and decide what is lost and what arrives."""
+        self._measured = self.channel.measured(channel, state.x, self._noisy, part)
+        self.channel.begin_round(channel, up, due, part)
+
+    def _exchange(
+        self,
+        channel: Memory,
+        state: PlantState,
+        due: NDArray[np.bool_],
+        before: Callable[[Range], object] = lambda part: None,
+        after: Callable[[Range], object] = lambda part: None,
+    ) -> None:
+        """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived.
+
+        `before` and `after` that, more is to be done in each range of the environments.
+        """
+
+        def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
+            self._run(lambda part: self.channel.receive(channel, link, row, held, part))
+
+        own = self._by_parts
+        if own is None:
+            self._run(before)
+            parts = self._message(state)
+            self._run(lambda part: self._send(channel, state, due, parts, part))
+            self.estimator.receive(state, take, due)
+            self._run(after)
+            return
+        parts = self._message(state)
+
+        def exchange(part: Range) -> None:
+            before(part)
+            self._send(channel, state, due, parts, part)
+            own.receive(state, functools.partial(self.channel.receive, channel, part=part), due, part)
+            after(part)
+
+        self._run(exchange)
+
+    def _message(self, state: PlantState) -> tuple[FloatArray, ...]:
+        """Parts of what all agents send now."""
+        memory, added = state.memory, self.estimator.message(state)
         if sum(map(len, added)) != self.estimator.width:
             raise ValueError(
                 f"estimator {self.estimator.name!r}: message() has {sum(map(len, added))} rows, its width is "
                 f"{self.estimator.width}"
             )
-        self.channel.send(channel, [*shared, *added], due)
+        shared = (memory[name] for name in ("center", "error", "stamp", "hops", "said", "data"))
+        if self._by_parts is None:
+            added = [np.require(values, np.float64, ["C", "W"]) for values in added]  # as compiled code takes them
+        return (state.t[None], self._measured, *shared, *added)
+
+    def _send(
+        self,
+        channel: Memory,
+        state: PlantState,
+        due: NDArray[np.bool_],
+        parts: tuple[FloatArray, ...],
+        part: Range,
+    ) -> None:
+        """Everybody sends; messages without delay arrive."""
+        self.channel.send(channel, parts, due, part)
         if not self.network.fewest_rounds_late:
-            self._merge(False, state, state.t, 1.0)  # nothing has to be moved
+            self._merge(channel, state, state.t, part, late=False)  # nothing has to be moved
 
-        def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
-            self.channel.receive(channel, link, row, held)
-
-        self.estimator.receive(state, take, due)
-
-    def _merge(self, late: bool, state: PlantState, t: FloatArray, dt: float) -> None:
-        """Take over fresher states; `t` is the time that predictions are of."""
-        memory, channel = state.memory, self._of_channel(state.memory)
-        behind = merge(
+    def _merge(self, channel: Memory, state: PlantState, t: FloatArray, part: Range, *, late: bool) -> bool:
+        """Take over fresher states; `t` is the time that predictions are of. Returns whether some lag behind it."""
+        memory = state.memory
+        return merge(
             self._sources,
             late,
             channel["sent"],
@@ -265,12 +350,11 @@ class Networked:
             memory["arrived"],
             memory["data"],
             self._lag,
+            *part,
         )
-        if behind:
-            self._reckoning.catch_up(memory["center"], memory["error"], t, self._lag, dt)
 
-    def _report(self, state: PlantState) -> None:
-        memory = state.memory
+    def _report(self, memory: Memory, part: Range) -> None:
+        """Estimates and bounds, from predictions and what the estimator proposes."""
         report(
             *self._pairs,
             self.estimator.proposal,
@@ -280,6 +364,7 @@ class Networked:
             memory[self.estimator.proposed] if self.estimator.proposed else memory["center"],
             memory["estimate"],
             memory["bound"],
+            *part,
         )
 
     def _fewest_rounds(self) -> FloatArray:

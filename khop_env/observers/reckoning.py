@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled
+from khop_env.compiled import compiled, place
 from khop_env.observers.certificate import Certificate
 from khop_env.observers.dead_reckoning import extended_drift
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 from khop_env.physics import AgentModel, read_only
+from khop_env.threads import Range
 
 _ROUNDING = 1e-15  # of a state, per step
 
@@ -83,12 +84,25 @@ class Reckoning:
             ),
         )
         self._rate = np.zeros((layout.size, num_envs))
-        self._length = np.zeros((layout.pairs, num_envs))
+        self._length, self._h = np.zeros((layout.pairs, num_envs)), np.zeros((1, num_envs))
+        self._all = 0, num_envs
 
-    def advance(self, p: FloatArray, r: FloatArray, t: FloatArray, h: float) -> None:
-        """Move predictions `p` (P, B) and errors `r` (P, B) from the times `t` (B,) by `h` seconds, in place."""
-        self._length.fill(h)
-        self._move(p, r, t[:, None])
+    def rates(self, p: FloatArray, t: FloatArray) -> None:
+        """Evaluate the drifts at the predictions `p` (P, B) and times `t` (B,), for the next `advance`."""
+        self._drift(p, t[:, None])
+
+    def advance(self, p: FloatArray, r: FloatArray, h: float, part: Range | None = None) -> None:
+        """Move predictions `p` (P, B) and errors `r` (P, B) by `h` seconds, in place, at the rates of `rates`.
+
+        Args:
+            p: changed.
+            r: changed.
+            h: in s.
+            part: environments in which to do so; all by default.
+        """
+        first, end = part or self._all
+        self._h[:, first:end] = h
+        move(self._arrays, self._h, self._rate, p, r, first, end)
 
     def catch_up(self, p: FloatArray, r: FloatArray, t: FloatArray, lag: FloatArray, h: float) -> None:
         """Move what is `lag` (pairs, B) seconds old to the times `t` (B,), in intervals of about `h`, as `advance`."""
@@ -96,7 +110,8 @@ class Reckoning:
         for number in range(int(intervals.max(initial=0.0))):
             with np.errstate(invalid="ignore", divide="ignore"):
                 self._length[...] = np.where(intervals > number, lag / intervals, 0.0)
-            self._move(p, r, (t - lag + number * self._length).T)
+            self._drift(p, (t - lag + number * self._length).T)
+            move(self._arrays, self._length, self._rate, p, r, *self._all)
 
     def radii(self, steps: IntArray, start: FloatArray, h: float) -> FloatArray:
         """(P, B) certified errors `steps` (pairs, B) intervals of `h` seconds after errors `start` (P,)."""
@@ -105,47 +120,51 @@ class Reckoning:
         out = np.broadcast_to(r, steps.shape).copy()
         zero, length = np.zeros_like(r), np.full((self._layout.pairs, 1), h)
         for number in range(int(steps.max(initial=0))):
-            move(self._arrays, length, zero, zero, r)
+            move(self._arrays, length, zero, zero, r, 0, 1)
             np.copyto(out, r, where=steps == number + 1)
         return out
 
-    def _move(self, p: FloatArray, r: FloatArray, t: FloatArray) -> None:
+    def _drift(self, p: FloatArray, t: FloatArray) -> None:
+        """Evaluate the drifts at the times `t`, (B, 1) or (B, pairs)."""
         for run in self._runs:
             count = run.pairs.stop - run.pairs.start
             states = read_only(p[run.columns].T.reshape(self._num_envs, count, run.components))
             times = read_only(t[:] if t.shape[1] == 1 else t[:, run.pairs])
             self._rate[run.columns] = run.drift(times, states).reshape(self._num_envs, -1).T
-        move(self._arrays, self._length, self._rate, p, r)
 
 
 @compiled
-def move(arrays: Any, length: FloatArray, rate: FloatArray, p: FloatArray, r: FloatArray) -> None:
-    """Move predictions, p += h rate, and certified errors r; `length` (pairs, B) is h, of 0 where nothing moves."""
+def move(arrays: Any, length: FloatArray, rate: FloatArray, p: FloatArray, r: FloatArray, first: int, end: int) -> None:
+    """Move predictions, p += h rate, and certified errors r, in the environments from `first` to `end` - 1.
+
+    `length` is h, 0 where nothing moves: (pairs, B), or (1, B) for all pairs alike.
+    """
     observers, components, columns, pairs, rows, starts, matrix, spread, pushed = arrays
-    batch = p.shape[1]
+    width, alike = end - first, length.shape[0] == 1
     most = 1
     for i in range(components.size):
         most = max(most, components[i])
-    before = np.empty((most, batch))
+    before, growing = np.empty((most, width)), np.empty(width)
     for i in range(observers.size):
         n = components[i]
         for a in range(observers[i]):
-            pair, column = pairs[i] + a, columns[i] + a * n
+            column, of_length = columns[i] + a * n, 0 if alike else pairs[i] + a
             for c in range(n):
-                for b in range(batch):
-                    before[c, b] = r[column + c, b]
+                for e in range(width):
+                    before[c, e] = r[column + c, place(first + e)]
             for c in range(n):
                 q, row = column + c, rows[i] + c
                 most_apart, c_bar = spread[row], pushed[row]
-                for b in range(batch):
-                    r[q, b] = 0.0
+                for e in range(width):
+                    growing[e] = 0.0
                 for k in range(n):
                     slope = matrix[starts[i] + c * n + k]
                     if slope != 0.0:
-                        for b in range(batch):
-                            r[q, b] += slope * before[k, b]
-                for b in range(batch):
-                    h = length[pair, b]
-                    wider = h * (min(r[q, b], most_apart) + c_bar) + _ROUNDING * abs(p[q, b])
-                    r[q, b] = before[c, b] + (wider if h > 0.0 and before[c, b] < math.inf else 0.0)
+                        for e in range(width):
+                            growing[e] += slope * before[k, e]
+                for e in range(width):
+                    b = place(first + e)
+                    h = length[of_length, b]
+                    wider = h * (min(growing[e], most_apart) + c_bar) + _ROUNDING * abs(p[q, b])
+                    r[q, b] = before[c, e] + (wider if h > 0.0 and before[c, e] < math.inf else 0.0)
                     p[q, b] += h * rate[q, b]

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.compiled import compiled, place
 from khop_env.network import Network
 from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
@@ -24,6 +25,7 @@ from khop_env.observers.funnel_observers import WidthsNow
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 from khop_env.observers.prediction import Prediction
 from khop_env.observers.scalar import solve_alone
+from khop_env.threads import Range
 
 
 class _Held(NamedTuple):
@@ -50,7 +52,7 @@ class Rounds:
     What is held is used as it came: neither predicted nor aged. All of its memory begins with "ppso.": "estimate" and
     "input_estimate", "held" and "input_held" of other agents, "neighbor_input", the inputs last heard of neighbours,
     and of the last round "eps", "input_eps" and the disagreements over their funnels, "normalized" and
-    "input_normalized".
+    "input_normalized". `receive` and `raise_extremes` also work on a `part` of the environments and touch no others.
     """
 
     name = "ppso"
@@ -61,7 +63,7 @@ class Rounds:
 
         Rounds last the `network`'s period, in `num_envs` environments.
         """
-        self._design, self._num_envs, self._period = design, num_envs, network.period
+        self._design, self._num_envs, self._period, self._all = design, num_envs, network.period, (0, num_envs)
         fleet, knowledge, states, inputs = design.fleet, design.knowledge, design.states.layout, design.inputs.layout
         self.proposal = np.array(
             [
@@ -123,15 +125,16 @@ class Rounds:
     def message(self, state: PlantState) -> list[FloatArray]:
         """Own inputs' effects, estimates of states and inputs, and the inputs' effects last heard of neighbours."""
         memory = state.memory
+        self._widths = self._rho.at(state.t), self._omega.at(state.t)  # for `receive`
         return [state.g, *(memory[f"ppso.{name}"] for name in ("estimate", "input_estimate", "neighbor_input"))]
 
-    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_]) -> None:
+    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
         """Hold what has come, and solve in the environments that are `due`."""
-        memory, design = state.memory, self._design
+        memory, design, (low, high) = state.memory, self._design, part or self._all
         take(self._input_link, self._input_row, memory["ppso.neighbor_input"])
         for held, funnels, widths, name in (
-            (self._states, design.states, self._rho, ""),
-            (self._inputs, design.inputs, self._omega, "input_"),
+            (self._states, design.states, self._widths[0], ""),
+            (self._inputs, design.inputs, self._widths[1], "input_"),
         ):
             if not funnels.layout.size:
                 continue
@@ -143,23 +146,31 @@ class Rounds:
                 held.offset,
                 self._period,
                 values,
-                widths.at(state.t),
+                widths,
                 due,
                 memory[f"ppso.{name}eps"],
                 memory[f"ppso.{name}estimate"],
                 memory[f"ppso.{name}normalized"],
+                low,
+                high,
             )
-        memory["input_estimate"][...] = memory["ppso.input_estimate"]
+        memory["input_estimate"][:, low:high] = memory["ppso.input_estimate"][:, low:high]
 
-    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+    def raise_extremes(self, state: PlantState, extremes: Extremes, part: Range | None = None) -> None:
         """Raise the largest |xi| / rho and |mu| / omega, of the disagreements at the last round."""
-        for name, largest in (
-            ("ppso.normalized", extremes.normalized),
-            ("ppso.input_normalized", extremes.input_normalized),
-        ):
-            values = state.memory[name]
-            if len(values):
-                np.maximum(largest, np.abs(values).max(axis=0), out=largest)
+        memory, (low, high) = state.memory, part or self._all
+        largest_size(memory["ppso.normalized"], extremes.normalized, low, high)
+        largest_size(memory["ppso.input_normalized"], extremes.input_normalized, low, high)
+
+
+@compiled
+def largest_size(values: FloatArray, largest: FloatArray, low: int, high: int) -> None:
+    """Raise `largest` (B,) to the largest |value| of any row (rows, B), in environments `low` to `high` - 1."""
+    for q in range(values.shape[0]):
+        for e in range(high - low):
+            b = place(low + e)
+            size, most = abs(values[q, b]), largest[b]
+            largest[b] = size if not size <= most and most == most else most  # a NaN stays
 
 
 def _held(layout: PairLayout, estimate: int, own: int, relayed: dict[tuple[int, int], int]) -> _Held:
