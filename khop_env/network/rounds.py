@@ -17,6 +17,7 @@ from khop_env.network.randomness import DELAY, EPISODE, EPISODE_ROUND, LOSS, NOI
 from khop_env.physics import FloatArray, IndexArray
 
 WORD = 64
+FEW_SLOTS = 4  # of the ring: up to so many one loop each, which vectorises, costs less than looking each place up
 
 
 class Rules(NamedTuple):
@@ -190,6 +191,11 @@ def take_heard(
                 in_use[over, slots[over, e]] = True
     for c in range(len(link)):
         over = link[c]
+        if in_use[over].sum() > FEW_SLOTS:
+            for e in range(width):
+                if slots[over, e] >= 0:
+                    out[c, place(low + e)] = sent[slots[over, e], row[c], place(low + e)]
+            continue
         for slot in range(capacity):
             if in_use[over, slot]:
                 for e in range(width):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.compiled import compiled, place
+from khop_env.network.rounds import FEW_SLOTS
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 
 TIME = 0  # row of a message's time
@@ -143,6 +144,14 @@ def merge(
         found = False
         for way in range(start[pair], start[pair + 1]):
             over, row = link[way], stamp_row[way]
+            if in_use[over].sum() > FEW_SLOTS:
+                found = True
+                for e in range(width):
+                    b, slot = place(low + e), slots[over, e]
+                    if slot >= 0 and sent[slot, row, b] > stamp[pair, b]:
+                        stamp[pair, b] = sent[slot, row, b]
+                        choice[e], slot_of[e] = way, slot
+                continue
             for slot in range(capacity):
                 if not in_use[over, slot]:
                     continue

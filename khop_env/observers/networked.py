@@ -9,10 +9,9 @@ adds what it wants to send, and estimates inside the boxes.
 from __future__ import annotations
 
 import copy
-import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +21,17 @@ from khop_env.observers.base import Assumptions, Certified, Extremes, Informatio
 from khop_env.observers.certificate import Certificate
 from khop_env.observers.certified import ages, report
 from khop_env.observers.design import ObserverDesign
-from khop_env.observers.estimators import Estimator, Relay
+from khop_env.observers.estimators import Estimator
+from khop_env.observers.exchange import CHANNEL, Exchange
 from khop_env.observers.known_estimators import as_estimator, require_memory, require_own_names
 from khop_env.observers.layout import FloatArray, IntArray
-from khop_env.observers.merging import Sources, largest_share, merge
+from khop_env.observers.merging import Sources, largest_share
 from khop_env.observers.proximal import MOST_THREADS
 from khop_env.observers.reckoning import Reckoning
-from khop_env.observers.rounds import Rounds
 from khop_env.observers.solve import LANES
 from khop_env.physics import AgentModel, hops_from_targets
 from khop_env.threads import Range, Threads
 
-_CHANNEL = "channel."
 T = TypeVar("T")
 
 
@@ -95,31 +93,24 @@ class Networked:
         self._reckoning = Reckoning(layout, received, num_envs)
         self.longest_step = min(self.network.period, self._reckoning.longest_step)
         sources = Sources.of(layout, fleet.n, len(fleet), self.message_size)
-        self._sources: Any = tuple(sources)
         self._pairs = sources.column, sources.components
         regions = np.concatenate([each.region for each in received])
         self._region = regions[layout.column_source]
         self.estimator = copy.copy(self.estimator)  # its buffers are this object's own
-        # a class derived from the library's may do other things, which may not be divided
-        own: Any = self.estimator if type(self.estimator) in (Rounds, Relay) else None
-        self._by_parts: Rounds | Relay | None = own
         shared = 1 + fleet.n + 2 * (layout.size + layout.pairs) + self.message_size * (len(fleet) + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         require_memory(self.estimator, sources.components)
-        self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
-        self._activity = None if design.schedule is None else design.activity()
-        self._up = np.ones((len(design.links), num_envs), np.bool_)
-        self._of_memory = [(name, _CHANNEL + name) for name in self.channel.allocate()]
-        self._lag = np.zeros((layout.pairs, num_envs))
-        self._noisy = np.zeros((fleet.n if self.network.noise else 0, num_envs))
-        self._fastest = self._fewest_rounds()
         self._threads = Threads(self.threads)
         self._ranges = self._threads.ranges(num_envs, LANES)
+        self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
+        self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self._run)
+        self._activity = None if design.schedule is None else design.activity()
+        self._up = np.ones((len(design.links), num_envs), np.bool_)
+        self._fastest = self._fewest_rounds()
 
     def allocate(self) -> Memory:
         """Predictions from what was received, its stamps and ways, the estimates, their bounds; channel; estimator."""
         (size, pairs), batch = (self.layout.size, self.layout.pairs), self.num_envs
-        channel = {_CHANNEL + name: values for name, values in self.channel.allocate().items()}
         memory = {
             "estimate": np.zeros((size, batch)),
             "input_estimate": np.zeros((self.design.inputs.layout.size, batch)),
@@ -133,7 +124,7 @@ class Networked:
             "data": np.zeros((pairs * self.message_size, batch)),
             "step": np.zeros(batch),
             "even_since": np.zeros(batch),
-            **channel,
+            **self._exchange.allocate(),
         }
         own = self.estimator.allocate()
         require_own_names(self.estimator, own, memory)
@@ -150,15 +141,16 @@ class Networked:
             memory[name][:, env_ids] = -1.0
         for name in ("hops", "input_estimate", "said", "data", "step", "even_since"):
             memory[name][..., env_ids] = 0.0
-        channel = self._of_channel(memory)
+        exchange = self._exchange
+        channel = exchange.of_channel(memory)
         self.channel.reset(channel, env_ids, rngs)
         heard = channel["heard"].copy()
         self.estimator.reset(memory, env_ids, first_guess)
         due = np.zeros(self.num_envs, np.bool_)
         due[env_ids] = True
         up = self.links_up(state)
-        self._run(lambda part: self._begin_round(channel, state, up, due, part))
-        self._exchange(channel, state, due)
+        self._run(lambda part: exchange.begin(channel, state, up, due, part))
+        exchange.complete(channel, state, due)
         np.copyto(channel["heard"], heard, where=~due)  # the others' last round is as it was
         self._run(lambda part: self._report(memory, part))
 
@@ -171,7 +163,8 @@ class Networked:
         memory = state.memory
         plant.stage(0, np.array([dt]), dt, before, state)  # first: nothing has changed yet if it raises
         plant.effect(state)
-        channel = self._of_channel(memory)
+        exchange = self._exchange
+        channel = exchange.of_channel(memory)
         due, up = self.channel.due(channel, state.t), self.links_up(state)
         rounds = bool(due.any())
         changed = np.abs(memory["step"] - dt) > 1e-9 * dt
@@ -179,13 +172,12 @@ class Networked:
         memory["step"].fill(dt)
 
         def begin(part: Range) -> bool:
-            self._begin_round(channel, state, up, due, part)
+            exchange.begin(channel, state, up, due, part)
             # as if late messages had arrived at the last grid point, and what they say had been moved from there
-            late = rounds and self.network.most_rounds_late > 0
-            return late and self._merge(channel, state, before.t, part, late=True)
+            return rounds and exchange.merge_late(channel, state, before.t, part)
 
         if any(self._run(begin)):
-            self._reckoning.catch_up(memory["center"], memory["error"], before.t, self._lag, dt)
+            self._reckoning.catch_up(memory["center"], memory["error"], before.t, exchange.lag, dt)
         self.estimator.predict(memory, before.t, dt)
         self._reckoning.rates(memory["center"], before.t)
 
@@ -195,7 +187,7 @@ class Networked:
                 self._report(memory, part)
 
         if rounds:
-            self._exchange(channel, state, due, move, lambda part: self._report(memory, part))
+            exchange.complete(channel, state, due, move, lambda part: self._report(memory, part))
         else:
             self._run(move)
         plant.actuate(state)
@@ -210,7 +202,7 @@ class Networked:
         """(L, B) whether each link of the design is up, overwritten by the next call; None where all are, always."""
         if self._activity is None:
             return None
-        return self._activity.up(state.memory[_CHANNEL + "key"], state.t, state.x, self._up)
+        return self._activity.up(state.memory[CHANNEL + "key"], state.t, state.x, self._up)
 
     def information(self, state: PlantState) -> Information:
         """Age, way and time of arrival of the newest state that each pair has received."""
@@ -228,7 +220,7 @@ class Networked:
             `out` (P, B), written.
         """
         h, period = float(state.memory["step"].max()) or self.longest_step, self.network.period
-        round_ = self._of_channel(state.memory)["round"]
+        round_ = state.memory[CHANNEL + "round"]
         rounds = self._fastest[:, None]
         since = np.maximum(state.t - round_ * period, 0.0)
         grid = np.floor((since + rounds * period) / h + 1e-6).astype(np.int64)
@@ -242,116 +234,22 @@ class Networked:
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
         """Raise running maxima: errors over certified bounds, and the estimator's own |xi| / rho."""
-        source, memory = self.layout.column_source, state.memory
+        source, memory, own = self.layout.column_source, state.memory, self._exchange.own
 
         def raised(part: Range) -> None:
             largest_share(source, memory["estimate"], state.x, memory["bound"], extremes.relative, *part)
-            if self._by_parts is not None:
-                self._by_parts.raise_extremes(state, extremes, part)
+            if own is not None:
+                own.raise_extremes(state, extremes, part)
 
         self._run(raised)
-        if self._by_parts is None:
+        if own is None:
             self.estimator.raise_extremes(state, extremes)
 
     # -- parts ---------------------------------------------------------------------------------------------------
 
-    def _of_channel(self, memory: Memory) -> Memory:
-        return {name: memory[key] for name, key in self._of_memory}
-
     def _run(self, work: Callable[[Range], T]) -> list[T]:
         """Results of `work` on all environments, a range for each thread."""
         return self._threads.run(work, self._ranges)
-
-    def _begin_round(
-        self, channel: Memory, state: PlantState, up: NDArray[np.bool_] | None, due: NDArray[np.bool_], part: Range
-    ) -> None:
-        """Measure what is to be sent, and decide what is lost and what arrives."""
-        self._measured = self.channel.measured(channel, state.x, self._noisy, part)
-        self.channel.begin_round(channel, up, due, part)
-
-    def _exchange(
-        self,
-        channel: Memory,
-        state: PlantState,
-        due: NDArray[np.bool_],
-        before: Callable[[Range], object] = lambda part: None,
-        after: Callable[[Range], object] = lambda part: None,
-    ) -> None:
-        """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived.
-
-        `before` and `after` that, more is to be done in each range of the environments.
-        """
-
-        def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
-            self._run(lambda part: self.channel.receive(channel, link, row, held, part))
-
-        own = self._by_parts
-        if own is None:
-            self._run(before)
-            parts = self._message(state)
-            self._run(lambda part: self._send(channel, state, due, parts, part))
-            self.estimator.receive(state, take, due)
-            self._run(after)
-            return
-        parts = self._message(state)
-
-        def exchange(part: Range) -> None:
-            before(part)
-            self._send(channel, state, due, parts, part)
-            own.receive(state, functools.partial(self.channel.receive, channel, part=part), due, part)
-            after(part)
-
-        self._run(exchange)
-
-    def _message(self, state: PlantState) -> tuple[FloatArray, ...]:
-        """Parts of what all agents send now."""
-        memory, added = state.memory, self.estimator.message(state)
-        if sum(map(len, added)) != self.estimator.width:
-            raise ValueError(
-                f"estimator {self.estimator.name!r}: message() has {sum(map(len, added))} rows, its width is "
-                f"{self.estimator.width}"
-            )
-        shared = (memory[name] for name in ("center", "error", "stamp", "hops", "said", "data"))
-        if self._by_parts is None:
-            added = [np.require(values, np.float64, ["C", "W"]) for values in added]  # as compiled code takes them
-        return (state.t[None], self._measured, *shared, *added)
-
-    def _send(
-        self,
-        channel: Memory,
-        state: PlantState,
-        due: NDArray[np.bool_],
-        parts: tuple[FloatArray, ...],
-        part: Range,
-    ) -> None:
-        """Everybody sends; messages without delay arrive."""
-        self.channel.send(channel, parts, due, part)
-        if not self.network.fewest_rounds_late:
-            self._merge(channel, state, state.t, part, late=False)  # nothing has to be moved
-
-    def _merge(self, channel: Memory, state: PlantState, t: FloatArray, part: Range, *, late: bool) -> bool:
-        """Take over fresher states; `t` is the time that predictions are of. Returns whether some lag behind it."""
-        memory = state.memory
-        return merge(
-            self._sources,
-            late,
-            channel["sent"],
-            channel["round"],
-            channel["newest"],
-            channel["heard"],
-            self.network.noise,
-            memory["even_since"],
-            t,
-            state.t,
-            memory["center"],
-            memory["error"],
-            memory["stamp"],
-            memory["hops"],
-            memory["arrived"],
-            memory["data"],
-            self._lag,
-            *part,
-        )
 
     def _report(self, memory: Memory, part: Range) -> None:
         """Estimates and bounds, from predictions and what the estimator proposes."""
@@ -385,9 +283,9 @@ def missed_rounds(observers: Observers, state: PlantState) -> FloatArray:
     """
     if not isinstance(observers, Networked):
         return np.zeros((len(observers.layout.links), len(state.t)))
-    network, newest = observers.network, state.memory[_CHANNEL + "newest"]
+    network, newest = observers.network, state.memory[CHANNEL + "newest"]
     on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
-    missed = state.memory[_CHANNEL + "round"] - newest - on_time
+    missed = state.memory[CHANNEL + "round"] - newest - on_time
     return np.where(newest < 0, math.inf, np.maximum(missed, 0))
 
 
