@@ -81,6 +81,7 @@ class Relay:
     name = "relay"
     proposed = ""
     width = 0
+    divisible = True
 
     def prepare(self, design: ObserverDesign, network: Network, num_envs: int, first_row: int) -> None:
         """Get ready for the pairs of `design`; the `network`, `num_envs` and `first_row` don't matter."""
@@ -93,7 +94,7 @@ class Relay:
     def reset(self, memory: Memory, env_ids: IntArray, first_guess: FloatArray) -> None:
         """Nothing to do."""
 
-    def predict(self, memory: Memory, t: FloatArray, dt: float) -> None:
+    def predict(self, memory: Memory, t: FloatArray, dt: float, part: Range | None = None) -> None:
         """Nothing to do."""
 
     def message(self, state: PlantState) -> list[FloatArray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,17 +14,11 @@ from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, merge
 from khop_env.observers.rounds import Rounds
-from khop_env.threads import Range
+from khop_env.observers.solve import LANES
+from khop_env.threads import Range, Threads
 
 CHANNEL = "channel."
 """Names of the channel's arrays in the memory of observers begin so."""
-
-Run = Callable[[Callable[[Range], Any]], list[Any]]
-"""Runs a function on all environments, a range for each thread."""
-
-
-def _nothing(part: Range) -> None:
-    """Nothing more is to be done."""
 
 
 class Exchange:
@@ -36,7 +29,7 @@ class Exchange:
         estimator: prepared.
         sources: where pairs may hear of their targets.
         states: number of components of the fleet's state.
-        run: runs work on all environments.
+        threads: that share the environments.
 
     Attributes:
         own: the estimator if it is one of the library's, which works on ranges of environments; else None: what another
@@ -44,14 +37,14 @@ class Exchange:
         lag: (pairs, B) time from the messages that were merged last to the time of the predictions, in s.
     """
 
-    def __init__(self, channel: Channel, estimator: Estimator, sources: Sources, states: int, run: Run) -> None:
-        self._channel, self._estimator, self._run = channel, estimator, run
+    def __init__(self, channel: Channel, estimator: Estimator, sources: Sources, states: int, threads: Threads) -> None:
+        self._channel, self._estimator, self._threads = channel, estimator, threads
         self._sources: Any = tuple(sources)
         library: Any = estimator if type(estimator) in (Rounds, Relay) else None
         self.own: Rounds | Relay | None = library
         self.lag = np.zeros((len(sources.column), channel.num_envs))
         self._noise = channel.network.noise
-        self._measured = self._noisy = np.zeros((states if self._noise else 0, channel.num_envs))
+        self._noisy = np.zeros((states if self._noise else 0, channel.num_envs))
         self._some_late = channel.network.most_rounds_late > 0
         self._some_at_once = channel.network.fewest_rounds_late == 0
         self._names = [(name, CHANNEL + name) for name in channel.allocate()]
@@ -76,7 +69,7 @@ class Exchange:
             due: (B,) environments in which there is a round.
             part: range of environments.
         """
-        self._measured = self._channel.measured(channel, state.x, self._noisy, part)
+        self._channel.measured(channel, state.x, self._noisy, part)
         self._channel.begin_round(channel, up, due, part)
 
     def merge_late(self, channel: Memory, state: PlantState, t: FloatArray, part: Range) -> bool:
@@ -90,47 +83,12 @@ class Exchange:
         """
         return self._some_late and self._merge(True, channel, state, t, part)
 
-    def complete(
-        self,
-        channel: Memory,
-        state: PlantState,
-        due: NDArray[np.bool_],
-        before: Callable[[Range], object] = _nothing,
-        after: Callable[[Range], object] = _nothing,
-    ) -> None:
-        """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived.
+    def parts(self, state: PlantState) -> tuple[FloatArray, ...]:
+        """Arrays of what all agents send now; a library's estimator doesn't read their values here.
 
-        Args:
-            channel: `of_channel`, after `begin`.
-            state: now.
-            due: (B,) environments in which there is a round.
-            before: more work on each range of environments, done first.
-            after: likewise, done last.
+        Raises:
+            ValueError: if the estimator's message hasn't its width.
         """
-        own = self.own
-        if own is None:
-            self._run(before)
-            parts = self._parts(state)
-            self._run(lambda part: self._send(channel, state, due, parts, part))
-
-            def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
-                self._run(lambda part: self._channel.receive(channel, link, row, held, part))
-
-            self._estimator.receive(state, take, due)
-            self._run(after)
-            return
-        parts = self._parts(state)
-
-        def work(part: Range) -> None:
-            before(part)
-            self._send(channel, state, due, parts, part)
-            own.receive(state, functools.partial(self._channel.receive, channel, part=part), due, part)
-            after(part)
-
-        self._run(work)
-
-    def _parts(self, state: PlantState) -> tuple[FloatArray, ...]:
-        """Rows of what all agents send now; none of them is read here."""
         memory, estimator = state.memory, self._estimator
         added = estimator.message(state)
         if (rows := sum(map(len, added))) != estimator.width:
@@ -138,14 +96,42 @@ class Exchange:
         if self.own is None:
             added = [np.require(values, np.float64, ["C", "W"]) for values in added]  # as compiled code takes them
         shared = (memory[name] for name in ("center", "error", "stamp", "hops", "said", "data"))
-        return (state.t[None], self._measured, *shared, *added)
+        return (state.t[None], self._noisy if self._noise else state.x, *shared, *added)
 
-    def _send(
+    def send(
         self, channel: Memory, state: PlantState, due: NDArray[np.bool_], parts: tuple[FloatArray, ...], part: Range
     ) -> None:
+        """Everybody sends what it knows now; messages without delay arrive.
+
+        Args:
+            channel: `of_channel`, after `begin`.
+            state: now.
+            due: (B,) environments in which there is a round.
+            parts: as `parts` returns them.
+            part: range of environments.
+        """
         self._channel.send(channel, parts, due, part)
         if self._some_at_once:
             self._merge(False, channel, state, state.t, part)  # nothing has to be moved
+
+    def receive(self, channel: Memory, state: PlantState, due: NDArray[np.bool_], part: Range) -> None:
+        """The estimator uses what has arrived; one that isn't the library's, in all environments at once.
+
+        Args:
+            channel: `of_channel`, after `send`.
+            state: now.
+            due: (B,) environments in which there is a round.
+            part: range of environments.
+        """
+        receive = functools.partial(self._channel.receive, channel)
+        if self.own is not None:
+            self.own.receive(state, functools.partial(receive, part=part), due, part)
+            return
+
+        def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
+            self._threads.run(lambda part: receive(link, row, held, part), self._threads.ranges(len(due), LANES))
+
+        self._estimator.receive(state, take, due)
 
     def _merge(self, late: bool, channel: Memory, state: PlantState, t: FloatArray, part: Range) -> bool:
         memory = state.memory

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from khop_env.network import Channel, Network
 from khop_env.observers.base import Assumptions, Certified, Extremes, Information, Memory, Observers, Plant, PlantState
-from khop_env.observers.certificate import Certificate
 from khop_env.observers.certified import ages, report
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.estimators import Estimator
@@ -27,9 +26,10 @@ from khop_env.observers.known_estimators import as_estimator, require_memory, re
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, largest_share
 from khop_env.observers.proximal import MOST_THREADS
-from khop_env.observers.reckoning import Reckoning
+from khop_env.observers.reckoning import Reckoning, certificates_of
 from khop_env.observers.solve import LANES
-from khop_env.physics import AgentModel, hops_from_targets
+from khop_env.observers.steps import Plan, Step
+from khop_env.physics import hops_from_targets
 from khop_env.threads import Range, Threads
 
 T = TypeVar("T")
@@ -88,7 +88,7 @@ class Networked:
         """Allocate buffers, and tabulate the certificates."""
         fleet, layout = design.fleet, design.knowledge
         self.design, self.num_envs, self.layout, self._assumed = design, num_envs, layout, assumed
-        received = _certificates(design, assumed, self.network.noise)
+        received = certificates_of(design, assumed, self.network.noise)
         self.uncertified = {i: each.reason for i, each in enumerate(received) if each.reason}
         self._reckoning = Reckoning(layout, received, num_envs)
         self.longest_step = min(self.network.period, self._reckoning.longest_step)
@@ -103,10 +103,11 @@ class Networked:
         self._threads = Threads(self.threads)
         self._ranges = self._threads.ranges(num_envs, LANES)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
-        self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self._run)
+        self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self._threads)
         self._activity = None if design.schedule is None else design.activity()
         self._up = np.ones((len(design.links), num_envs), np.bool_)
         self._fastest = self._fewest_rounds()
+        self._plan_steps()
 
     def allocate(self) -> Memory:
         """Predictions from what was received, its stamps and ways, the estimates, their bounds; channel; estimator."""
@@ -141,18 +142,14 @@ class Networked:
             memory[name][:, env_ids] = -1.0
         for name in ("hops", "input_estimate", "said", "data", "step", "even_since"):
             memory[name][..., env_ids] = 0.0
-        exchange = self._exchange
-        channel = exchange.of_channel(memory)
+        channel = self._exchange.of_channel(memory)
         self.channel.reset(channel, env_ids, rngs)
         heard = channel["heard"].copy()
         self.estimator.reset(memory, env_ids, first_guess)
         due = np.zeros(self.num_envs, np.bool_)
         due[env_ids] = True
-        up = self.links_up(state)
-        self._run(lambda part: exchange.begin(channel, state, up, due, part))
-        exchange.complete(channel, state, due)
+        self._carry_out(self._first_round, Step(state, channel, due, self.links_up(state)))
         np.copyto(channel["heard"], heard, where=~due)  # the others' last round is as it was
-        self._run(lambda part: self._report(memory, part))
 
     def advance(self, plant: Plant, before: PlantState, state: PlantState, dt: float) -> None:
         """Advance `state`, a copy of `before`, by `dt` seconds, and run the round that is due then, if any.
@@ -163,33 +160,12 @@ class Networked:
         memory = state.memory
         plant.stage(0, np.array([dt]), dt, before, state)  # first: nothing has changed yet if it raises
         plant.effect(state)
-        exchange = self._exchange
-        channel = exchange.of_channel(memory)
-        due, up = self.channel.due(channel, state.t), self.links_up(state)
-        rounds = bool(due.any())
+        channel = self._exchange.of_channel(memory)
+        due = self.channel.due(channel, state.t)
         changed = np.abs(memory["step"] - dt) > 1e-9 * dt
         np.copyto(memory["even_since"], before.t, where=changed)
         memory["step"].fill(dt)
-
-        def begin(part: Range) -> bool:
-            exchange.begin(channel, state, up, due, part)
-            # as if late messages had arrived at the last grid point, and what they say had been moved from there
-            return rounds and exchange.merge_late(channel, state, before.t, part)
-
-        if any(self._run(begin)):
-            self._reckoning.catch_up(memory["center"], memory["error"], before.t, exchange.lag, dt)
-        self.estimator.predict(memory, before.t, dt)
-        self._reckoning.rates(memory["center"], before.t)
-
-        def move(part: Range) -> None:
-            self._reckoning.advance(memory["center"], memory["error"], dt, part)
-            if not rounds:
-                self._report(memory, part)
-
-        if rounds:
-            exchange.complete(channel, state, due, move, lambda part: self._report(memory, part))
-        else:
-            self._run(move)
+        self._carry_out(self._whole_step, Step(state, channel, due, self.links_up(state), before.t, dt))
         plant.actuate(state)
 
     def bound(self, state: PlantState, out: FloatArray) -> Certified:
@@ -251,7 +227,68 @@ class Networked:
         """Results of `work` on all environments, a range for each thread."""
         return self._threads.run(work, self._ranges)
 
-    def _report(self, memory: Memory, part: Range) -> None:
+    def _plan_steps(self) -> None:
+        """Decide which work may be divided."""
+        own, reckoning = self._exchange.own, self._reckoning.divisible
+        begin = [(Networked._begin, True)]
+        move = [
+            (Networked._catch_up, reckoning),
+            (Networked._predict, own is not None and own.divisible),
+            (Networked._move, reckoning),
+        ]
+        end = [
+            (Networked._compose, own is not None),
+            (Networked._send, True),
+            (Networked._receive, own is not None),
+            (Networked._report, True),
+        ]
+        self._whole_step, self._first_round = Plan([*begin, *move, *end]), Plan([*begin, *end])
+
+    def _carry_out(self, plan: Plan[Networked], step: Step) -> None:
+        if self._exchange.own is not None and step.rounds:
+            step.parts = self._exchange.parts(step.state)  # of the library's estimators: here, on one thread
+        plan.carry_out(self, step, self._threads, self._ranges)
+
+    def _begin(self, step: Step, part: Range) -> None:
+        """Decide what arrives; take over what has been on its way."""
+        self._exchange.begin(step.channel, step.state, step.up, step.due, part)
+        # as if late messages had arrived at the last grid point, and what they say had been moved from there
+        if step.dt and step.rounds and self._exchange.merge_late(step.channel, step.state, step.t, part):
+            step.behind.add(part)
+
+    def _catch_up(self, step: Step, part: Range) -> None:
+        if any(part[0] <= first < part[1] for first, _ in step.behind):
+            memory = step.state.memory
+            lag = self._exchange.lag
+            self._reckoning.catch_up(memory["center"], memory["error"], step.t, lag, step.dt, part)
+
+    def _predict(self, step: Step, part: Range) -> None:
+        own, memory = self._exchange.own, step.state.memory
+        if own is None:
+            self.estimator.predict(memory, step.t, step.dt)
+        else:
+            own.predict(memory, step.t, step.dt, part)
+
+    def _move(self, step: Step, part: Range) -> None:
+        memory = step.state.memory
+        self._reckoning.advance(memory["center"], memory["error"], step.t, step.dt, part)
+
+    def _compose(self, step: Step, part: Range) -> None:
+        if self._exchange.own is None and step.rounds:
+            step.parts = self._exchange.parts(step.state)
+
+    def _send(self, step: Step, part: Range) -> None:
+        if step.rounds:
+            self._exchange.send(step.channel, step.state, step.due, step.parts, part)
+
+    def _receive(self, step: Step, part: Range) -> None:
+        if step.rounds:
+            self._exchange.receive(step.channel, step.state, step.due, part)
+
+    def _report(self, step: Step, part: Range) -> None:
+        self._clip(step.state.memory, part)
+
+    def _clip(self, memory: Memory, part: Range) -> None:
         """Estimates and bounds, from predictions and what the estimator proposes."""
         report(
             *self._pairs,
@@ -287,19 +324,3 @@ def missed_rounds(observers: Observers, state: PlantState) -> FloatArray:
     on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
     missed = state.memory[CHANNEL + "round"] - newest - on_time
     return np.where(newest < 0, math.inf, np.maximum(missed, 0))
-
-
-def _certificates(design: ObserverDesign, assumed: Assumptions, noise: float) -> list[Certificate]:
-    """Per agent the certificate of a state that it sent; equal ones are one object."""
-    made: dict[tuple[AgentModel, bytes, bytes], Certificate] = {}
-    found = []
-    reach = np.abs(assumed.center) + assumed.radius
-    for i, model in enumerate(design.fleet.models):
-        part = design.fleet.state_slice(i)
-        disturbance = assumed.disturbance[part]
-        region = model.operating_region(reach[part], disturbance)
-        key = model, disturbance.tobytes(), region.tobytes()
-        if key not in made:
-            made[key] = Certificate(model, disturbance=disturbance, start=noise, region=region)
-        found.append(made[key])
-    return found

@@ -20,10 +20,9 @@ from khop_env.compiled import compiled, place
 from khop_env.network import Network
 from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
+from khop_env.observers.drifts import Drift, Drifts
 from khop_env.observers.estimators import Take
-from khop_env.observers.funnel_observers import WidthsNow
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
-from khop_env.observers.prediction import Prediction
 from khop_env.observers.scalar import solve_alone
 from khop_env.threads import Range
 
@@ -52,7 +51,10 @@ class Rounds:
     What is held is used as it came: neither predicted nor aged. All of its memory begins with "ppso.": "estimate" and
     "input_estimate", "held" and "input_held" of other agents, "neighbor_input", the inputs last heard of neighbours,
     and of the last round "eps", "input_eps" and the disagreements over their funnels, "normalized" and
-    "input_normalized". `receive` and `raise_extremes` also work on a `part` of the environments and touch no others.
+    "input_normalized". Methods also work on a `part` of the environments and touch no others.
+
+    Attributes:
+        divisible: as that of `Drifts`: whether `predict` may be called so in several threads at once; once prepared.
     """
 
     name = "ppso"
@@ -89,9 +91,18 @@ class Rounds:
         heard = {pair: neighbor_input + start for pair, start in place.items()}
         self._states = _held(states, estimate, 1, known)
         self._inputs = _held(inputs, input_estimate, own_input, heard)
-        self._rho, self._omega = WidthsNow(design.states.rho, num_envs), WidthsNow(design.inputs.rho, num_envs)
-        self._prediction = Prediction(design, num_envs)
+        self._rho, self._omega = np.ones((states.rows, num_envs)), np.ones((inputs.rows, num_envs))
+        known_drifts = [
+            Drift(fleet.models[i], fleet.models[i].drift) if design.options[i].drift else None
+            for i in states.target.tolist()
+        ]
+        self._drifts = Drifts(states, known_drifts, num_envs)
+        self.divisible = self._drifts.divisible
         self._rate = np.zeros((states.size, num_envs))
+        self._input = np.full(states.size, -1)  # row of the input estimate that belongs to each estimate
+        for who, first in inputs.slot.items():
+            n = fleet.models[who[1]].n
+            self._input[states.slot[who] : states.slot[who] + n] = np.arange(first, first + n)
 
     def allocate(self) -> Memory:
         """See the class."""
@@ -115,17 +126,18 @@ class Rounds:
         memory["ppso.estimate"][:, env_ids] = first_guess[self._design.states.layout.column_source][:, None]
         memory["ppso.held"][:, env_ids] = first_guess[self._states.source][:, None]
 
-    def predict(self, memory: Memory, t: FloatArray, dt: float) -> None:
+    def predict(self, memory: Memory, t: FloatArray, dt: float, part: Range | None = None) -> None:
         """Y += dt (f(y) + g_hat), explicit Euler as in the proximal step of order 1."""
+        low, high = part or self._all
         estimate = memory["ppso.estimate"]
-        self._prediction.rate(t, estimate, memory["ppso.input_estimate"], self._rate)
-        self._rate *= dt
-        estimate += self._rate
+        self._drifts.evaluate(estimate, t[low:high, None], self._rate, (low, high))
+        predict(self._rate, memory["ppso.input_estimate"], self._input, dt, estimate, low, high)
 
     def message(self, state: PlantState) -> list[FloatArray]:
         """Own inputs' effects, estimates of states and inputs, and the inputs' effects last heard of neighbours."""
         memory = state.memory
-        self._widths = self._rho.at(state.t), self._omega.at(state.t)  # for `receive`
+        self._design.states.rho.evaluate(state.t, self._rho)  # for `receive`
+        self._design.inputs.rho.evaluate(state.t, self._omega)
         return [state.g, *(memory[f"ppso.{name}"] for name in ("estimate", "input_estimate", "neighbor_input"))]
 
     def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
@@ -133,8 +145,8 @@ class Rounds:
         memory, design, (low, high) = state.memory, self._design, part or self._all
         take(self._input_link, self._input_row, memory["ppso.neighbor_input"])
         for held, funnels, widths, name in (
-            (self._states, design.states, self._widths[0], ""),
-            (self._inputs, design.inputs, self._widths[1], "input_"),
+            (self._states, design.states, self._rho, ""),
+            (self._inputs, design.inputs, self._omega, "input_"),
         ):
             if not funnels.layout.size:
                 continue
@@ -161,6 +173,26 @@ class Rounds:
         memory, (low, high) = state.memory, part or self._all
         largest_size(memory["ppso.normalized"], extremes.normalized, low, high)
         largest_size(memory["ppso.input_normalized"], extremes.input_normalized, low, high)
+
+
+@compiled
+def predict(
+    rate: FloatArray, inputs: FloatArray, input_of: IntArray, dt: float, estimate: FloatArray, low: int, high: int
+) -> None:
+    """Move estimates (P, B) by `dt` s at their rates (P, B) plus rows `input_of` (P,) of `inputs`, -1 for none.
+
+    In environments `low` to `high` - 1.
+    """
+    for q in range(estimate.shape[0]):
+        own = input_of[q]
+        if own < 0:
+            for e in range(high - low):
+                b = place(low + e)
+                estimate[q, b] += rate[q, b] * dt
+        else:
+            for e in range(high - low):
+                b = place(low + e)
+                estimate[q, b] += (rate[q, b] + inputs[own, b]) * dt
 
 
 @compiled

@@ -378,7 +378,7 @@ def test_an_error_that_is_not_a_number_is_reported():
 def test_a_proposal_that_is_not_a_number_gives_the_prediction():
     simulator = chain([SingleIntegrator()] * 3, "wifi", LastHeard())
     simulator.state.memory["held.state"][...] = np.nan
-    simulator.observers._report(simulator.state.memory, (0, 1))
+    simulator.observers._clip(simulator.state.memory, (0, 1))
     np.testing.assert_array_equal(simulator.estimates.T, simulator.state.memory["center"])
 
 
