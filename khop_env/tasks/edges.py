@@ -88,7 +88,7 @@ class EdgeTask(Task):
         # of each edge a number that grows with it, for `_desired`
         code = self.edges[:, 0] * len(fleet) + self.edges[:, 1]
         self._by_number = np.argsort(code, kind="stable")
-        self._numbers = code[self._by_number]
+        self._codes = code[self._by_number]
         self._reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
         number = {agent: order for order, agent in enumerate(members)}
         counted = np.array([i in number for i in self.edges[:, 0].tolist()], bool)
@@ -106,7 +106,7 @@ class EdgeTask(Task):
             input_owner,
         )
         self._arrays: Any = tuple(arrays)  # Numba recognises the types of a plain tuple more quickly
-        self._numbers = arrays.own.size + fleet.m + len(members)
+        self._work = arrays.own.size + fleet.m + len(members)
         self._period = world.control_period
         self._squares = np.zeros((len(members), world.num_envs))
         self._efforts = np.zeros((len(members), world.num_envs))
@@ -128,7 +128,7 @@ class EdgeTask(Task):
         reward, error = np.empty(shape), np.empty(shape)
         period, effort = float(world.control_period), float(self.effort)
         arrays = self._arrays, world.x, world.inputs, self._squares, self._efforts, reward, error
-        world.each(lambda low, high: evaluate_edges(*arrays, period, effort, low, high), self._numbers)
+        world.each(lambda low, high: evaluate_edges(*arrays, period, effort, low, high), self._work)
         if self.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
         terminated = np.zeros(world.num_envs, bool)
@@ -149,8 +149,8 @@ class EdgeTask(Task):
 
     def _desired(self, world: World, agent: int, other: int) -> list[float]:
         number = agent * len(world.fleet) + other
-        place = int(self._numbers.searchsorted(number))
-        if place < len(self._numbers) and self._numbers[place] == number:
+        place = int(self._codes.searchsorted(number))
+        if place < len(self._codes) and self._codes[place] == number:
             return self.displacement[self._by_number[place]].tolist()
         return [0.0] * self.displacement.shape[1]
 
