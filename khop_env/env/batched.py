@@ -292,7 +292,7 @@ class BatchedEnv:
             self.task.drive(self.world, self._physical)
             inputs[self._driven] = self._physical[self._driven] / self._limit[self._driven]
         self.simulator.hold(self._physical)
-        self.simulator.advance(dt, self._parts)
+        self.simulator.step_unchecked(dt, self._parts)
         self.task.moved(self.world, number)
 
     def _evaluate(self) -> Outcome:

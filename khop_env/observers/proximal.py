@@ -129,6 +129,11 @@ class Proximal(FunnelObservers):
                 found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], slope, of_inputs)
                 self._account(found, self.design.inputs, state.g, omega)
 
+    @property
+    def stages(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+        """Of the last step, stage by stage: the predictions' rates (P, B), the corrections (P, B) and (Q, B)."""
+        return self._rates, self._slopes, self._input_slopes
+
     def _weights_of(self, dt: float) -> list[tuple[FloatArray, FloatArray, float]]:
         """Per stage the explicit weights, the implicit ones, and the last of these, all in s."""
         if dt != self._dt:

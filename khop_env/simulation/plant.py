@@ -50,6 +50,11 @@ class FleetPlant:
         self._t = np.zeros(0)
         self._w = np.zeros((fleet.n, num_envs)).T  # (B, n) in the memory order of the states
 
+    @property
+    def rates(self) -> tuple[FloatArray, ...]:
+        """(n, B) rates at the stages of the last step, from its beginning on."""
+        return self._rates
+
     def rate(self, state: PlantState, out: FloatArray) -> None:
         """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
         states = self._bind(state)
