@@ -25,6 +25,7 @@ TOLERANCES = (1e-9, 1.0)
 
 GAMMA = TABLEAUS[2].nodes[0]
 _SHORTEST = 1e-7  # s: what changes by more than the tolerance in a step of this length has jumped; it is taken as it is
+_MOST_STEPS = 1e8  # between the present and a time to reach
 _MOVED = 0.01  # of 1 + |x|, by which states move in the first step that is tried
 # The PI controller of E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), IV.2, after
 # K. Gustafsson (1991): exponents 0.7 / k and 0.4 / k for an estimate of order k = 2 in the step.
@@ -115,11 +116,16 @@ class StepControl:
         """Refuse a time that can't be reached.
 
         Raises:
-            ValueError: if it isn't finite, or is past.
+            ValueError: if it isn't finite, is past, or is too far away for a drift that takes short steps only.
         """
-        now = float(self.simulator.state.t[0])
+        now, longest = float(self.simulator.state.t[0]), self.simulator.longest_step
         if not now - SLACK <= until < math.inf:
-            raise ValueError(f"until must be a time since reset from now on, t = {now:g} s; got {until!r}")
+            raise ValueError(f"until must be a finite time since reset, not before now, t = {now:g} s; got {until!r}")
+        if until - now > _MOST_STEPS * longest:
+            raise ValueError(
+                f"until = {until:g} s is too far away: a drift takes steps of {longest:.3g} s at most, and {until - now:g} "
+                f"s are more than {_MOST_STEPS:g} of them"
+            )
 
     def run(self, until: float) -> None:
         """Take steps up to `until`; errors as in `step`."""
