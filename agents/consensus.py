@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from agents.lyapunov import ComparisonGain, consensus_gain
-from agents.velocity_law import VelocityLaw, sum_edges
+from agents.velocity_law import VelocityLaw
 from khop_env.observers import FloatArray
 from khop_env.scenarios import Scenario
-from khop_env.simulation import View
+from khop_env.simulation import EdgeLaw, View
+from khop_env.simulation.edge_law import LINEAR, TANH, sum_edges
 
 
 @dataclass
@@ -31,9 +32,13 @@ class TanhConsensus(VelocityLaw):
     def __post_init__(self) -> None:
         self.require_positive("gain")
 
+    def edge_law(self) -> EdgeLaw | None:
+        """Its compiled form; a subclass may have another `command`."""
+        return EdgeLaw(TANH, self.gain) if type(self) is TanhConsensus else None
+
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
         """The gain times the sum of tanh of the displacements."""
-        sum_edges(self.gain, True, view.edges, displacement, velocity)
+        sum_edges(self.gain, True, view.edges[:, 0], displacement, velocity, 0, velocity.shape[2])
 
     def speed_limit(self, most_edges: int) -> float:
         """The gain per edge, since |tanh| < 1."""
@@ -65,9 +70,13 @@ class LinearConsensus(VelocityLaw):
     def __post_init__(self) -> None:
         self.require_positive("gain")
 
+    def edge_law(self) -> EdgeLaw | None:
+        """Its compiled form; a subclass may have another `command`."""
+        return EdgeLaw(LINEAR, self.gain, 0.0, self.cancel_drift) if type(self) is LinearConsensus else None
+
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
         """The gain times the sum of the displacements."""
-        sum_edges(self.gain, False, view.edges, displacement, velocity)
+        sum_edges(self.gain, False, view.edges[:, 0], displacement, velocity, 0, velocity.shape[2])
 
     def set_iss_gain(self, scenario: Scenario) -> ComparisonGain | None:
         """The analytical gain on a scenario, or None if none can be derived."""

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.velocity_law import VelocityLaw, sum_edges
+from agents.velocity_law import VelocityLaw
 from khop_env.observers import FloatArray
-from khop_env.simulation import View
+from khop_env.simulation import EdgeLaw, View
+from khop_env.simulation.edge_law import LIMITED_MEAN, sum_edges
 
 
 @dataclass
@@ -36,9 +37,13 @@ class FormationLaw(VelocityLaw):
     def __post_init__(self) -> None:
         self.require_positive("gain", "speed")
 
+    def edge_law(self) -> EdgeLaw | None:
+        """Its compiled form; a subclass may have another `command`."""
+        return EdgeLaw(LIMITED_MEAN, self.gain, self.speed, self.cancel_drift) if type(self) is FormationLaw else None
+
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
         """The gain times the mean displacement, its norm limited to `speed`."""
-        sum_edges(self.gain, False, view.edges, displacement, velocity)
+        sum_edges(self.gain, False, view.edges[:, 0], displacement, velocity, 0, velocity.shape[2])
         velocity /= np.maximum(view.known_edges(), 1)[:, None]
         length = np.sqrt((velocity * velocity).sum(axis=1, keepdims=True))
         velocity *= self.speed / np.maximum(length, self.speed)

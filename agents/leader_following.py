@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.velocity_law import VelocityLaw, sum_edges
+from agents.velocity_law import VelocityLaw
 from khop_env.observers import FloatArray
-from khop_env.simulation import View
+from khop_env.simulation import EdgeLaw, View
+from khop_env.simulation.edge_law import SHRUNK_MEAN, sum_edges
 
 
 @dataclass
@@ -41,13 +42,23 @@ class LeaderFollowingLaw(VelocityLaw):
         if not 0.0 <= self.shrink <= 1.0:
             raise ValueError(f"shrink must be from 0 to 1; got {self.shrink!r}")
 
+    def edge_law(self) -> EdgeLaw | None:
+        """Its compiled form; a subclass may have another `command`."""
+        return (
+            EdgeLaw(SHRUNK_MEAN, self.gain, self.shrink, self.cancel_drift)
+            if type(self) is LeaderFollowingLaw
+            else None
+        )
+
     def command(self, view: View, displacement: FloatArray, velocity: FloatArray) -> None:
         """The gain times the distance to the scaled reference."""
         agents = len(velocity)
         edges = np.bincount(view.edges[:, 0], minlength=agents)[:, None, None]
         known = view.known_edges()[:, None]
         position = view.fleet.positions(view.x).transpose(1, 2, 0)
-        sum_edges(1.0, False, view.edges, displacement, velocity)  # sum over known edges of q - p
+        sum_edges(
+            1.0, False, view.edges[:, 0], displacement, velocity, 0, velocity.shape[2]
+        )  # sum over known edges of q - p
         velocity += known * position
         velocity *= self.shrink / np.maximum(known, 1)
         velocity -= position

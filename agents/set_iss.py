@@ -320,7 +320,7 @@ class _Push:
     def __init__(self, scenario: Scenario, run: Simulator) -> None:
         disturbance, self._run = scenario.disturbance, run
         self._attached = None if disturbance is None else disturbance.attach(scenario.fleet)
-        self._drawn, self._w = run.save().drawn, np.zeros(run.x.shape)
+        self._drawn, self._w = run.save().drawn, np.zeros(run.x.shape[::-1]).T
 
     def __call__(self) -> FloatArray:
         run = self._run

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
 import numpy as np
 
-from khop_env.compiled import compiled
-from khop_env.elementary import tanh
-from khop_env.observers import FloatArray, IntArray
-from khop_env.physics import velocity_to_input
-from khop_env.simulation import View
+from khop_env.observers import FloatArray
+from khop_env.physics import Fleet, velocity_to_input
+from khop_env.simulation import EdgeLaw, View
 
 VELOCITY_INPUTS = ("integrator", "drifter")  # types of agents with x' = f(x) + u, all of whose states are positions
 
@@ -38,6 +37,10 @@ class VelocityLaw:
         """Write commanded velocities (N, d, B), in m/s, from displacements (E, d, B) along `view.edges`, in m."""
         raise NotImplementedError(f"{type(self).__name__} has no command(view, displacement, velocity)")
 
+    def edge_law(self) -> EdgeLaw | None:
+        """The compiled form for simulators; None, the default, for laws whose `command` is Python."""
+        return None
+
     def speed_limit(self, most_edges: int) -> float:
         """Bound on each component of a command in m/s, for up to `most_edges` task edges per agent; inf by default."""
         return math.inf
@@ -48,7 +51,7 @@ class VelocityLaw:
             self._prepare(view)
         self.command(view, view.displacement.transpose(1, 2, 0), self._velocity)
         velocity, batch = self._velocity.transpose(2, 0, 1), len(view.x)
-        if self._direct:
+        if self.is_input(view.fleet, self._most_edges):
             return velocity.reshape(batch, -1)
         for group in view.fleet.groups:
             states = view.x[:, group.state_slice].reshape(batch, group.size, group.model.n)
@@ -77,34 +80,16 @@ class VelocityLaw:
         self._view = view
         self._velocity = np.zeros((len(fleet), fleet.position_dim, batch))
         self._u = np.zeros((batch, fleet.m))
-        # if commands can't exceed the limits of integrators, they are the inputs
-        most = self.speed_limit(int(np.bincount(view.edges[:, 0], minlength=len(fleet)).max(initial=0)))
-        self._direct = not self.cancel_drift and all(
-            group.model.type in VELOCITY_INPUTS and np.all(group.model.input_limit >= most) for group in fleet.groups
-        )
+        self._most_edges = int(np.bincount(view.edges[:, 0], minlength=len(fleet)).max(initial=0))
+
+    def is_input(self, fleet: Fleet, most_edges: int) -> bool:
+        """Whether commands are inputs as they are: of integrators, whose limits they can't exceed."""
+        return not self.cancel_drift and self.speed_limit(most_edges) <= _smallest_velocity_limit(fleet)
 
 
-@compiled
-def sum_edges(gain: float, bounded: bool, edges: IntArray, displacement: FloatArray, out: FloatArray) -> None:
-    """Write gain * sum over edges of displacement (E, d, B), or of its tanh if `bounded`, into `out` (N, d, B)."""
-    out[:] = 0.0
-    dim, batch = displacement.shape[1], displacement.shape[2]
-    if not bounded:
-        for edge in range(edges.shape[0]):
-            for c in range(dim):
-                for env in range(batch):
-                    out[edges[edge, 0], c, env] += gain * displacement[edge, c, env]
-    elif batch > 1:
-        for edge in range(edges.shape[0]):
-            agent = edges[edge, 0]
-            for c in range(dim):
-                for env in range(batch):
-                    out[agent, c, env] += gain * tanh(displacement[edge, c, env])
-    else:
-        terms = np.empty(displacement.size)  # one environment: vectorise along the edges instead
-        flat = displacement.reshape(-1)
-        for q in range(flat.size):
-            terms[q] = gain * tanh(flat[q])
-        for edge in range(edges.shape[0]):
-            for c in range(dim):
-                out[edges[edge, 0], c, 0] += terms[edge * dim + c]
+@functools.lru_cache(maxsize=64)
+def _smallest_velocity_limit(fleet: Fleet) -> float:
+    """Of agents whose input is a velocity, in m/s; negative where others are in the fleet."""
+    if any(group.model.type not in VELOCITY_INPUTS for group in fleet.groups):
+        return -1.0
+    return float(fleet.input_limit.min())

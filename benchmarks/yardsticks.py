@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from agents.consensus import TanhConsensus
-from agents.velocity_law import sum_edges
 from khop_env.compiled import compiled
 from khop_env.elementary import log_ratio
 from khop_env.observers import FloatArray
@@ -16,7 +15,7 @@ from khop_env.observers.performance import exponentials
 from khop_env.physics import drifting_integrator_drift
 from khop_env.physics.waveforms import add_sines
 from khop_env.simulation import Simulator
-from khop_env.simulation.view import displacements
+from khop_env.simulation.edge_law import displacements, sum_edges
 
 
 @compiled
@@ -38,19 +37,19 @@ def closed_loop_derivative(
     x, y, ghat = z
     dx, dy, dghat = dz
     terms, u, e, xi, rho, w = work
-    displacements(law[2], law[3], law[4], x, y, terms)
-    sum_edges(law[0], True, law[1], terms, u)
+    displacements(law[2], law[3], law[4], x, y, terms, 0, t.size)
+    sum_edges(law[0], True, law[1], terms, u, 0, t.size)
     g = u.reshape(x.shape)
     drifting_integrator_drift(x, dx)
     w[:] = 0.0
-    add_sines(t, sines[0], 1, sines[1], sines[2], w)
+    add_sines(t, sines[0], 0, 1, sines[1], sines[2], w, 0, t.size)
     for column in range(x.shape[0]):
         for env in range(x.shape[1]):
-            dx[column, env] += g[column, env] + w[env, column]
-    exponentials(t, funnels[3], funnels[4], funnels[5], rho)
+            dx[column, env] += g[column, env] + w[column, env]
+    exponentials(t, funnels[3], funnels[4], funnels[5], rho, 0, t.size)
     disagreement(inputs, ghat, g, xi)
     correction(inputs, xi, rho, e, dghat)
-    exponentials(t, funnels[0], funnels[1], funnels[2], rho)
+    exponentials(t, funnels[0], funnels[1], funnels[2], rho, 0, t.size)
     disagreement(states, y, x, xi)
     correction(states, xi, rho, e, dy)
     drifting_integrator_drift(y, xi)
@@ -97,6 +96,8 @@ class CompiledPaper:
         assert views is not None
         assert isinstance(law, TanhConsensus)
         assert plant.disturbance is not None
+        edges = views.edge_arrays()
+        assert edges is not None
         _, channels, part = plant.disturbance._parts[0]
         pairs, batch = design.states.layout.size, simulator.num_envs
         self.t = state.t.copy()
@@ -107,14 +108,14 @@ class CompiledPaper:
             design.inputs.layout.arrays,
             (*design.states.rho.coefficients, *design.inputs.rho.coefficients),
             (np.ascontiguousarray(state.drawn[:, part]), channels.index, channels.amplitude),
-            (law.gain, views.view.edges, *views.sources),
+            (law.gain, edges.agent, edges.kind, edges.own, edges.other),
         )
         self._work = (
             np.zeros((len(views.view.edges), 2, batch)),
             np.zeros((len(simulator.fleet), 2, batch)),
             *(np.zeros((pairs, batch)) for _ in range(2)),
             np.zeros((design.states.layout.rows, batch)),
-            np.zeros((batch, simulator.fleet.n)),
+            np.zeros((simulator.fleet.n, batch)),
         )
 
     def run(self, dt: float, steps: int) -> None:

@@ -33,6 +33,7 @@ class OrderOption(enum.StrEnum):
 
     ONE = "1"
     TWO = "2"
+    THREE = "3"
 
 
 @dataclass
@@ -126,10 +127,10 @@ def continuous(
             raise ValueError("--dt: the size of steps follows from --tolerance; give one of the two")
         if explicit or order is OrderOption.ONE:
             wrong = "--order 1" if order is OrderOption.ONE else "--integrator explicit"
-            raise ValueError(f"{wrong}: --tolerance estimates the error of the proximal step of order 2; leave it out")
-        order = OrderOption.TWO
-    if explicit and order is OrderOption.TWO:
-        raise ValueError("--order 2: the explicit integrator is forward Euler, of order 1; leave --order out")
+            raise ValueError(f"{wrong}: --tolerance is for the proximal step of order 2 or 3; leave it out")
+        order = order or OrderOption.THREE
+    if explicit and order not in (None, OrderOption.ONE):
+        raise ValueError(f"--order {order}: the explicit integrator is forward Euler, of order 1; leave --order out")
     duration = scenario.duration if duration is None else duration
     dt: float = steps["--dt"] if steps["--dt"] is not None else EXPLICIT_STEP if explicit else scenario.dt
     number_of_steps(duration, dt)  # refuses too many of them before anything is built

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from khop_env.compiled import compiled, inlined
+from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import log_ratio
 from khop_env.observers.layout import FloatArray, PairArrays, PairLayout
 from khop_env.observers.weights import Weights
@@ -145,6 +145,8 @@ def largest_ratios(
     inverse_row_sums: FloatArray,
     normalized: FloatArray,
     relative: FloatArray,
+    low: int,
+    high: int,
 ) -> None:
     """Raise running maxima to the largest |xi| / rho and |x_tilde| / (M^-1 rho) over all pairs and components.
 
@@ -156,10 +158,12 @@ def largest_ratios(
         inverse_row_sums: (pairs,) [M_i^-1 1]_a.
         normalized: (B,) running maxima of |xi| / rho; inf where a number isn't finite.
         relative: (B,) running maxima of |x_tilde_a| / ([M_i^-1 1]_a rho_i).
+        low: first environment.
+        high: one past the last.
     """
     pairs = PairArrays(*pairs)
-    batch = estimate.shape[1]
-    xi = np.empty(batch)
+    width = high - low
+    xi = np.empty(width)
     for t in range(pairs.observers.size):
         eta, n, pair = pairs.observers[t], pairs.components[t], pairs.pair[t]
         offset, origin, row = pairs.column[t], pairs.source[t], pairs.row[t]
@@ -168,19 +172,21 @@ def largest_ratios(
             factor = 1.0 / inverse_row_sums[pair + a]
             for c in range(n):
                 column = offset + a * n + c
-                for env in range(batch):
-                    xi[env] = d * estimate[column, env] - h * source[origin + c, env]
+                for e in range(width):
+                    at = place(low + e)
+                    xi[e] = d * estimate[column, at] - h * source[origin + c, at]
                 for k in range(pairs.entry_start[pair + a], pairs.entry_start[pair + a + 1]):
                     other = offset + pairs.entry[k] * n + c
-                    for env in range(batch):
-                        xi[env] -= estimate[other, env]
-                for env in range(batch):
-                    scale = 1.0 / rho[row + c, env]
-                    ratio = abs(xi[env]) * scale
-                    error = abs(estimate[column, env] - source[origin + c, env]) * scale * factor
+                    for e in range(width):
+                        xi[e] -= estimate[other, place(low + e)]
+                for e in range(width):
+                    at = place(low + e)
+                    scale = 1.0 / rho[row + c, at]
+                    ratio = abs(xi[e]) * scale
+                    error = abs(estimate[column, at] - source[origin + c, at]) * scale * factor
                     ratio = ratio if ratio < np.inf else np.inf  # a NaN must not pass as small
-                    normalized[env] = max(normalized[env], ratio)
-                    relative[env] = max(relative[env], error)
+                    normalized[at] = max(normalized[at], ratio)
+                    relative[at] = max(relative[at], error)
 
 
 @compiled

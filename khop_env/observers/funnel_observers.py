@@ -161,7 +161,7 @@ class FunnelObservers:
                 continue
             rho, maxima = widths.at(state.t), (normalized, relative)
             if up is None:
-                largest_ratios(layout.packed, estimate, source, rho, layout.inverse_row_sums, *maxima)
+                largest_ratios(layout.packed, estimate, source, rho, layout.inverse_row_sums, *maxima, 0, self.num_envs)
             else:
                 weights: WeightsNow = getattr(links, kind)
                 now, sums = weights.of(up), weights.inverse_row_sums(up)

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from khop_env.compiled import compiled
+from khop_env.compiled import compiled, place
 from khop_env.elementary import expm1
 from khop_env.physics import read_only
 
@@ -107,6 +107,7 @@ class FunnelBank:
         functions: one per row.
 
     Attributes:
+        exponential: whether all are an `Exponential`.
         coefficients: rho(0) - rho(infinity), rho(infinity) and decay rate of each exponential row, (rows,) each.
     """
 
@@ -119,6 +120,7 @@ class FunnelBank:
             np.array([f.rate for f in exponential], dtype=float),
         )
         self._others = [(r, f) for r, f in enumerate(self.functions) if not isinstance(f, Exponential)]
+        self.exponential = not self._others
 
     def __len__(self) -> int:
         return len(self.functions)
@@ -129,7 +131,7 @@ class FunnelBank:
         Raises:
             ValueError: if a function that isn't an `Exponential` gives values that are not positive and finite.
         """
-        exponentials(t, *self.coefficients, out)
+        exponentials(t, *self.coefficients, out, 0, t.size)
         for row, function in self._others:
             out[row] = function(read_only(t[:]))
             if not np.all((out[row] > 0.0) & np.isfinite(out[row])):
@@ -145,14 +147,17 @@ class FunnelBank:
 
 
 @compiled
-def exponentials(t: FloatArray, decaying: FloatArray, final: FloatArray, rate: FloatArray, out: FloatArray) -> None:
-    """Write decaying exp(-rate t) + final into `out` (rows, B) at the times `t` (B,)."""
-    decay = np.empty(t.size)
+def exponentials(
+    t: FloatArray, decaying: FloatArray, final: FloatArray, rate: FloatArray, out: FloatArray, low: int, high: int
+) -> None:
+    """Write decaying exp(-rate t) + final into `out` (rows, B), in the environments low to high - 1 with times `t`."""
+    width = high - low
+    decay = np.empty(width)
     for row in range(rate.size):
         if row == 0 or rate[row] != rate[row - 1]:  # one rate for all is the usual case
             speed = rate[row]
-            for env in range(t.size):
-                decay[env] = expm1(-min(speed * t[env], 700.0)) + 1.0
+            for e in range(width):
+                decay[e] = expm1(-min(speed * t[place(low + e)], 700.0)) + 1.0
         start, floor = decaying[row], final[row]
-        for env in range(t.size):
-            out[row, env] = start * decay[env] + floor
+        for e in range(width):
+            out[row, place(low + e)] = start * decay[e] + floor

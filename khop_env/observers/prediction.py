@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from khop_env.observers.design import ObserverDesign
-from khop_env.observers.layout import FloatArray
+from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.physics import AgentModel, read_only
+from khop_env.physics.right_hand_sides import Runs
 
 
 class _DriftRun(NamedTuple):
@@ -31,6 +34,20 @@ class Prediction:
         self._inputs = _shared_columns(design)
         predicted = sum(run.columns.stop - run.columns.start for run in self._drifts)
         self._all_drifts_known = predicted == design.states.layout.size
+
+    def compiled_runs(self) -> tuple[Any, IntArray, bool]:
+        """What `rate` adds up, for a compiled loop.
+
+        Returns:
+            The fields of `physics.right_hand_sides.Runs` of the estimates with a drift, None where a drift is Python;
+            (3, K) runs of estimates with an input observer: first row, the same among the input estimates, number; and
+            whether all estimates have a drift.
+        """
+        known = all(run.model.form is not None for run in self._drifts)
+        runs = tuple(Runs.of([(run.model, run.pairs, run.columns.start, 0) for run in self._drifts])) if known else None
+        inputs = [(states.start, ours.start, states.stop - states.start) for states, ours in self._inputs]
+        table = np.ascontiguousarray(np.array(inputs, np.int64).reshape(-1, 3).T)
+        return runs, table, self._all_drifts_known
 
     def rate(self, t: FloatArray, estimate: FloatArray, input_estimate: FloatArray, out: FloatArray) -> None:
         """Write f_i(x_hat) + g_hat into `out` (P, B), at times (B,), estimates (P, B) and input estimates (Q, B)."""

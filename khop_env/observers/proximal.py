@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,9 +33,9 @@ class Tableau:
 
 _GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
 _DELTA = 1.0 - 1.0 / (2.0 * _GAMMA)
-# ARS(1,1,1) and ARS(2,2,2): U. M. Ascher, S. J. Ruuth, R. J. Spiteri, Implicit-explicit Runge-Kutta methods for
-# time-dependent partial differential equations, 1997. Stiffly accurate: a step's result is its last stage, which is a
-# proximal step itself, so the funnel is kept at every grid point and in every stage.
+# ARS(1,1,1), ARS(2,2,2) and ARS(4,4,3): U. M. Ascher, S. J. Ruuth, R. J. Spiteri, Implicit-explicit Runge-Kutta methods
+# for time-dependent partial differential equations, 1997. Stiffly accurate: a step's result is its last stage, which is
+# a proximal step itself, so the funnel is kept at every grid point and in every stage.
 TABLEAUS = {
     1: Tableau(nodes=(1.0,), explicit=((1.0,),), implicit=((1.0,),)),
     2: Tableau(
@@ -42,10 +43,29 @@ TABLEAUS = {
         explicit=((_GAMMA,), (_DELTA, 1.0 - _DELTA)),
         implicit=((_GAMMA,), (1.0 - _GAMMA, _GAMMA)),
     ),
+    3: Tableau(
+        nodes=(1 / 2, 2 / 3, 1 / 2, 1.0),
+        explicit=((1 / 2,), (11 / 18, 1 / 18), (5 / 6, -5 / 6, 1 / 2), (1 / 4, 7 / 4, 3 / 4, -7 / 4)),
+        implicit=((1 / 2,), (1 / 6, 1 / 2), (-1 / 2, 1 / 2, 1 / 2), (3 / 2, -3 / 2, 1 / 2, 1 / 2)),
+    ),
 }
 
 
 MOST_THREADS = 256
+
+
+class Stages(NamedTuple):
+    """The parts of a step's stages.
+
+    Attributes:
+        predicted: (stages, P, B) f(x_hat) + g_hat at the stage before.
+        slopes: (stages, P, B) the state observers' correction at the stage.
+        input_slopes: (stages, Q, B) the input observers'.
+    """
+
+    predicted: FloatArray
+    slopes: FloatArray
+    input_slopes: FloatArray
 
 
 class Proximal(FunnelObservers):
@@ -54,12 +74,14 @@ class Proximal(FunnelObservers):
     Its memory adds "eps" (P, B) and "nu" (Q, B): the transformed disagreements, from which the next solve starts.
 
     Args:
-        order: 1 or 2.
+        order: 1, 2 or 3.
         threads: number of threads that share the environments (or targets, in a small batch); results don't depend
             on it.
 
     Attributes:
         evaluations: of the barrier, in all steps so far.
+        prediction: f(x_hat) + g_hat, once prepared.
+        stages: the parts of the last step, once prepared.
 
     Raises:
         ValueError: if there is no such order, or threads is out of range.
@@ -70,7 +92,7 @@ class Proximal(FunnelObservers):
 
     def __init__(self, order: int = 2, threads: int = 1) -> None:
         if order not in TABLEAUS:
-            raise ValueError(f"the proximal step exists at order 1 and 2; got order={order!r}")
+            raise ValueError(f"the proximal step exists at order 1, 2 and 3; got order={order!r}")
         if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or not 1 <= threads <= MOST_THREADS:
             raise ValueError(f"threads must be an integer from 1 to {MOST_THREADS}; got {threads!r}")
         self.order, self.threads = order, threads
@@ -78,6 +100,8 @@ class Proximal(FunnelObservers):
         self._tableau = TABLEAUS[order]
         self._explicit, self._implicit = self._tableau.explicit, self._tableau.implicit
         self._dt = math.nan
+        nothing = np.zeros((0, 0))
+        self._scheme = math.nan, (nothing, nothing, nothing)
 
     def __repr__(self) -> str:
         return f"Proximal(order={self.order}, threads={self.threads})"
@@ -85,12 +109,10 @@ class Proximal(FunnelObservers):
     def prepare(self, design: ObserverDesign, num_envs: int, assumed: Assumptions) -> None:
         """Allocate the buffers for steps of `design` in `num_envs` environments."""
         super().prepare(design, num_envs, assumed)
-        stages = range(len(self._tableau.nodes))
-        pairs, input_pairs = design.states.layout.size, design.inputs.layout.size
-        self._prediction = Prediction(design, num_envs)
-        self._rates = tuple(np.zeros((pairs, num_envs)) for _ in stages)
-        self._slopes = tuple(np.zeros((pairs, num_envs)) for _ in stages)
-        self._input_slopes = tuple(np.zeros((input_pairs, num_envs)) for _ in stages)
+        count, pairs, input_pairs = len(self._tableau.nodes), design.states.layout.size, design.inputs.layout.size
+        self.prediction = Prediction(design, num_envs)
+        self.stages = Stages(*(np.zeros((count, size, num_envs)) for size in (pairs, pairs, input_pairs)))
+        self._rates, self._slopes, self._input_slopes = (tuple(each) for each in self.stages)
         self._threads = Threads(self.threads)
         self._solve_states = Solver(design.states.layout, num_envs, self._threads)
         self._solve_inputs = Solver(design.inputs.layout, num_envs, self._threads)
@@ -110,7 +132,7 @@ class Proximal(FunnelObservers):
         estimate, input_estimate = memory["estimate"], memory["input_estimate"]
         for s, node in enumerate(self._tableau.nodes):
             # rates at the stage before: the state holds that stage's values, at its time
-            self._prediction.rate(state.t, estimate, input_estimate, self._rates[s])
+            self.prediction.rate(state.t, estimate, input_estimate, self._rates[s])
             explicit, implicit, tau = weights[s]
             plant.stage(s, explicit, node * dt, before, state)
             weighted_sum(last["estimate"], explicit, self._rates[: s + 1], estimate)
@@ -119,7 +141,7 @@ class Proximal(FunnelObservers):
             rho = self.rho.at(state.t)
             of_states, of_inputs = weights_at(self.links, state)
             found = self._solve_states(tau, estimate, state.x, rho, memory["eps"], self._slopes[s], of_states)
-            self._account(found, self.design.states, state.x, rho)
+            self.account(found, self.design.states, state.x, rho)
             plant.actuate(state)
             if self.design.inputs.layout.size:
                 if s:
@@ -127,12 +149,17 @@ class Proximal(FunnelObservers):
                 omega = self.omega.at(state.t)
                 slope = self._input_slopes[s]
                 found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], slope, of_inputs)
-                self._account(found, self.design.inputs, state.g, omega)
+                self.account(found, self.design.inputs, state.g, omega)
 
-    @property
-    def stages(self) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]:
-        """Of the last step, stage by stage: the predictions' rates (P, B), the corrections (P, B) and (Q, B)."""
-        return self._rates, self._slopes, self._input_slopes
+    def scheme(self, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times of the stages (S,), explicit and implicit weights (S, S), all in s, for a step of `dt` seconds."""
+        if dt != self._scheme[0]:
+            count = len(self._tableau.nodes)
+            explicit, implicit = np.zeros((count, count)), np.zeros((count, count))
+            for s, (a, b, _) in enumerate(self._weights_of(dt)):
+                explicit[s, : s + 1], implicit[s, : s + 1] = a, b
+            self._scheme = dt, (np.array(self._tableau.nodes) * dt, explicit, implicit)
+        return self._scheme[1]
 
     def _weights_of(self, dt: float) -> list[tuple[FloatArray, FloatArray, float]]:
         """Per stage the explicit weights, the implicit ones, and the last of these, all in s."""
@@ -142,10 +169,8 @@ class Proximal(FunnelObservers):
             self._dt = dt
         return self._weights
 
-    def _account(
-        self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray
-    ) -> None:
-        """Count the work of a solve.
+    def account(self, found: list[tuple[int, int, int]], funnels: Funnels, source: FloatArray, rho: FloatArray) -> None:
+        """Count the work of a solve of `funnels`, of the values `source` within `rho`, range by range.
 
         Raises:
             SolveError: if the solve failed, with the reason.

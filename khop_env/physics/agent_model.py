@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.physics.growth import Growth
+from khop_env.physics.right_hand_sides import Form
 
 FloatArray: TypeAlias = NDArray[np.float64]
 """An array of float64."""
@@ -105,6 +106,7 @@ class AgentModel:
         input_limit: Symmetric bound |u| <= input_limit, a number or one per input, np.inf for unbounded; reads as
             an array of shape (m,) once the model is built.
         input_map_uses_state: Whether g depends on x. If so there is no input observer for it (the paper's Remark 1).
+        form: Its compiled form, for the library's own; None for models whose right-hand sides are Python.
     """
 
     type: str
@@ -113,6 +115,11 @@ class AgentModel:
     position: tuple[str, ...]
     input_limit: InputLimit
     input_map_uses_state: bool = False
+    form: Form | None = None
+
+    def __init_subclass__(cls) -> None:
+        if "form" not in vars(cls):
+            cls.form = None  # a subclass may have another drift than the class whose compiled form it would inherit
 
     def __init__(self) -> None:
         self.validate()

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
 from khop_env.physics.agent_model import FloatArray, IndexArray, did_you_mean
 from khop_env.physics.fleet import Fleet
+from khop_env.physics.waveforms import Form, TermArrays, disturb
 
 Amplitude: TypeAlias = float | tuple[float, ...]
 
@@ -78,10 +79,16 @@ class Term(Disturbance):
         amplitude: Bound on |w| in state units per second: one number for every state, or one for each of
             an agent's states.
         agents: The agents it acts on: None for all, a type ("vessel"), an id ("vessel_0"), or a tuple of these.
+        form: Its compiled form, for the library's own; None for those whose `add` is Python.
     """
 
     amplitude: Amplitude
     agents: str | tuple[str, ...] | None = field(default=None, kw_only=True)
+    form: ClassVar[Form | None] = None
+
+    def __init_subclass__(cls) -> None:
+        if "form" not in vars(cls):
+            cls.form = None  # a subclass may have another `add` than the class whose compiled form it would inherit
 
     def __post_init__(self) -> None:
         for name in ("amplitude", "agents"):
@@ -156,6 +163,7 @@ class AttachedDisturbance:
     Attributes:
         bound: Bound on each component of |w| in state units per second, shape (n,).
         draws: Number K of random numbers that an episode holds.
+        arrays: The fields of `TermArrays` as a plain tuple, where all terms have a compiled form; None otherwise.
     """
 
     def __init__(self, terms: Sequence[Term], fleet: Fleet) -> None:
@@ -168,6 +176,7 @@ class AttachedDisturbance:
             count = term.draw(np.random.default_rng(0), channels).size  # a dry run that counts its random numbers
             self._parts.append((term, channels, slice(self.draws, self.draws + count)))
             self.draws += count
+        self.arrays: tuple[Any, ...] | None = _arrays(self._parts, fleet)
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """Random numbers for one episode, shape (K,)."""
@@ -185,10 +194,34 @@ class AttachedDisturbance:
         Returns:
             `out`.
         """
+        if self.arrays is not None:
+            disturb(self.arrays, t, x.T, drawn, out.T, 0, len(t))
+            return out
         out.fill(0.0)
         for term, channels, part in self._parts:
             term.add(t, x, drawn[:, part], channels, out)
         return out
+
+
+def _arrays(parts: Sequence[tuple[Term, Channels, slice]], fleet: Fleet) -> tuple[Any, ...] | None:
+    forms = [form for form in (term.form for term, _, _ in parts) if form is not None]
+    if len(forms) < len(parts):
+        return None
+    kind, count, first, second = zip(*forms, strict=True) if forms else ((), (), (), ())
+    sizes = [channels.index.size for _, channels, _ in parts]
+    return tuple(
+        TermArrays(
+            np.array(kind, np.int64),
+            np.array(count, np.int64),
+            np.array(first, np.float64),
+            np.array(second, np.float64),
+            np.array([part.start for _, _, part in parts], np.int64),
+            np.cumsum([0, *sizes]),
+            np.concatenate([np.zeros(0, np.int64), *(channels.index for _, channels, _ in parts)]),
+            np.concatenate([np.zeros(0), *(channels.amplitude for _, channels, _ in parts)]),
+            np.ascontiguousarray(fleet.position_index),
+        )
+    )
 
 
 def freeze_list(term: Term, name: str) -> None:

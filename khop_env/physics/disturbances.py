@@ -13,7 +13,7 @@ import numpy as np
 from khop_env.physics.agent_model import FloatArray
 from khop_env.physics.disturbance import Channels, Term, freeze_list
 from khop_env.physics.fleet import Fleet
-from khop_env.physics.waveforms import add_coupling, add_gusts, add_sines
+from khop_env.physics.waveforms import COUPLING, GUSTS, SINES, Form, add_coupling, add_gusts, add_sines
 
 _MOST_DRAWN = 10_000  # sines or pulses of one channel
 _SHORTEST_PULSE = 1e-6  # s
@@ -48,9 +48,14 @@ class BandLimitedNoise(Term):
         """Angular frequencies and phases, shape (2, components, C)."""
         return _draw_sines(rng, self.band, self.components, channels)
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its waveform, compiled."""
+        return Form(SINES, int(self.components))
+
     def add(self, t: FloatArray, x: FloatArray, drawn: FloatArray, channels: Channels, out: FloatArray) -> None:
         """Add the sines."""
-        add_sines(t, drawn, self.components, channels.index, channels.amplitude, out)
+        add_sines(t, drawn, 0, self.components, channels.index, channels.amplitude, out.T, 0, len(t))
 
 
 @dataclass(frozen=True)
@@ -71,9 +76,14 @@ class Sinusoid(Term):
         """Angular frequencies and phases, shape (2, 1, C)."""
         return _draw_sines(rng, self.frequency, 1, channels)
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its waveform, compiled."""
+        return Form(SINES, 1)
+
     def add(self, t: FloatArray, x: FloatArray, drawn: FloatArray, channels: Channels, out: FloatArray) -> None:
         """Add the sine."""
-        add_sines(t, drawn, 1, channels.index, channels.amplitude, out)
+        add_sines(t, drawn, 0, 1, channels.index, channels.amplitude, out.T, 0, len(t))
 
 
 @dataclass(frozen=True)
@@ -111,10 +121,15 @@ class Gust(Term):
         shape = (self.pulses, channels.index.size)
         return np.stack([rng.uniform(0.0, self.period - self.duration, shape), rng.choice((-1.0, 1.0), shape)])
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its waveform, compiled."""
+        return Form(GUSTS, int(self.pulses), float(self.duration), float(self.period))
+
     def add(self, t: FloatArray, x: FloatArray, drawn: FloatArray, channels: Channels, out: FloatArray) -> None:
         """Add the pulse of each environment's current window."""
         window = (self.duration, self.period, self.pulses)
-        add_gusts(t, drawn, *window, channels.index, channels.amplitude, out)
+        add_gusts(t, drawn, 0, *window, channels.index, channels.amplitude, out.T, 0, len(t))
 
 
 @dataclass(frozen=True)
@@ -140,9 +155,14 @@ class Coupling(Term):
         """The position components of its agents."""
         return self.channels_of(fleet, list(fleet.position_index), "position axes")
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its waveform, compiled."""
+        return Form(COUPLING, first=float(self.gain))
+
     def add(self, t: FloatArray, x: FloatArray, drawn: FloatArray, channels: Channels, out: FloatArray) -> None:
         """Add the pull."""
-        add_coupling(x, self.gain, channels.positions, channels.index, channels.amplitude, out)
+        add_coupling(x.T, self.gain, channels.positions, channels.index, channels.amplitude, out.T, 0, len(t))
 
 
 DISTURBANCES: dict[str, type[Term]] = {

@@ -10,11 +10,12 @@ import operator
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import SupportsIndex
+from typing import Any, SupportsIndex
 
 import numpy as np
 
 from khop_env.physics.agent_model import AgentModel, FloatArray, IndexArray, did_you_mean, require_shape
+from khop_env.physics.right_hand_sides import Runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,7 @@ class Fleet:
         position_index: Where each agent's position sits in the flat state, shape (N, d).
         input_limit: Symmetric input bounds, shape (m,).
         input_map_bound: Bounds on the components of |g|, shape (n,).
+        runs: The groups for compiled loops, the fields of `right_hand_sides.Runs`; None where a model is Python.
 
     Raises:
         ValueError: There are no models, an entry isn't a model, positions differ in dimension, agents of one type
@@ -100,6 +102,10 @@ class Fleet:
         self.input_map_bound: FloatArray = np.concatenate(
             [np.tile(group.model.checked_input_map_bound(), group.size) for group in self.groups]
         )
+
+        known = all(group.model.form is not None for group in self.groups)
+        parts = [(each.model, each.size, each.state_slice.start, each.input_slice.start) for each in self.groups]
+        self.runs: tuple[Any, ...] | None = tuple(Runs.of(parts)) if known else None
 
     def __len__(self) -> int:
         """Number of agents N."""

@@ -13,9 +13,20 @@ from types import MappingProxyType
 import numpy as np
 
 from khop_env.compiled import compiled
-from khop_env.elementary import sin, tanh
 from khop_env.physics.agent_model import AgentModel, FloatArray, InputLimit
 from khop_env.physics.growth import Growth, energy_region, ship_growth
+from khop_env.physics.right_hand_sides import (
+    CART,
+    DRIFTER,
+    INTEGRATOR,
+    UNICYCLE,
+    VESSEL,
+    Form,
+    drifter_drift,
+    drifts,
+    evaluated,
+    input_maps,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +62,11 @@ class SingleIntegrator(AgentModel):
         """All coordinates."""
         return tuple(self.states)
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its right-hand sides, compiled."""
+        return Form(INTEGRATOR)
+
     def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """Drift f = 0."""
         return np.zeros_like(x)
@@ -70,23 +86,8 @@ class SingleIntegrator(AgentModel):
 
 @compiled
 def drifting_integrator_drift(x: FloatArray, out: FloatArray) -> None:
-    """Write the drift of DriftingIntegrator at the columns x (2 agents, B) into `out` of the same shape.
-
-    Rows alternate between x1 and x2; the loop runs along whichever axis is longer, so that it vectorises.
-    """
-    agents, batch = x.shape[0] // 2, x.shape[1]
-    if batch >= agents:
-        for r in range(agents):
-            for b in range(batch):
-                out[2 * r, b] = tanh(0.5 * (x[2 * r, b] + x[2 * r + 1, b]))
-            for b in range(batch):
-                out[2 * r + 1, b] = sin(0.5 * (x[2 * r, b] - x[2 * r + 1, b]))
-    else:
-        for b in range(batch):
-            for r in range(agents):
-                out[2 * r, b] = tanh(0.5 * (x[2 * r, b] + x[2 * r + 1, b]))
-            for r in range(agents):
-                out[2 * r + 1, b] = sin(0.5 * (x[2 * r, b] - x[2 * r + 1, b]))
+    """Write the drift of DriftingIntegrator at the columns x (2 agents, B) into `out` of the same shape."""
+    drifter_drift(x.shape[0] // 2, 0, x, out, 0, x.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +106,14 @@ class DriftingIntegrator(AgentModel):
     inputs = MappingProxyType({"u1": "m/s", "u2": "m/s"})
     position = ("x1", "x2")
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its right-hand sides, compiled."""
+        return Form(DRIFTER)
+
     def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """The f of the paper's simulation section, compiled."""
-        batch, agents = x.shape[:2] if x.ndim == 3 else (1, x.size // 2)
-        columns = x.reshape(batch, agents, 2).transpose(1, 2, 0).reshape(2 * agents, batch)  # a view in a simulator
-        out = np.empty(columns.shape)
-        drifting_integrator_drift(columns, out)
-        return out.reshape(agents, 2, batch).transpose(2, 0, 1).reshape(x.shape)
+        return evaluated(drifts, Form(DRIFTER), 2, x)
 
     def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
         """Input map g = u."""
@@ -149,6 +151,11 @@ class DoubleIntegrator(AgentModel):
         if not 0.0 <= self.damping < math.inf:
             raise ValueError(f"DoubleIntegrator.damping must be finite and not negative (1/s); got {self.damping!r}")
         super().__post_init__()
+
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its right-hand sides, compiled."""
+        return Form(CART, (float(self.damping),))
 
     def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """Drift f = [v, -damping v]."""
@@ -189,14 +196,18 @@ class Unicycle(AgentModel):
     position = ("x", "y")
     input_map_uses_state = True
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its right-hand sides, compiled."""
+        return Form(UNICYCLE)
+
     def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """Drift f = 0."""
         return np.zeros_like(x)
 
     def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
         """Input map g = [v cos(heading), v sin(heading), omega]."""
-        speed, heading = u[..., 0], x[..., 2]
-        return np.stack([speed * np.cos(heading), speed * np.sin(heading), u[..., 1]], axis=-1)
+        return evaluated(input_maps, Form(UNICYCLE), 3, x, u)
 
     def input_map_bound(self) -> FloatArray:
         """Exact over all headings: [v, v, omega] at their limits."""
@@ -252,21 +263,14 @@ class SurfaceVessel(AgentModel):
             object.__setattr__(self, name, values)
         super().__post_init__()
 
+    @property
+    def form(self) -> Form:  # type: ignore[override]
+        """Its right-hand sides, compiled."""
+        return vessel_form(self)
+
     def drift(self, t: FloatArray, x: FloatArray) -> FloatArray:
         """Drift f = [R(heading) nu, -M^-1 (C(nu) nu + D(nu) nu)]."""
-        heading, nu = x[..., 2], x[..., 3:]
-        u, v, r = nu[..., 0], nu[..., 1], nu[..., 2]
-        m1, m2, m3 = self.mass
-        drag = (np.array(self.linear_drag) + np.array(self.quadratic_drag) * np.abs(nu)) * nu
-        cos, sin = np.cos(heading), np.sin(heading)
-        rate = np.empty_like(x)
-        rate[..., 0] = cos * u - sin * v
-        rate[..., 1] = sin * u + cos * v
-        rate[..., 2] = r
-        rate[..., 3] = (m2 * v * r - drag[..., 0]) / m1
-        rate[..., 4] = (-m1 * u * r - drag[..., 1]) / m2
-        rate[..., 5] = ((m1 - m2) * u * v - drag[..., 2]) / m3
-        return rate
+        return evaluated(drifts, vessel_form(self), 6, x)
 
     def input_map(self, t: FloatArray, x: FloatArray, u: FloatArray) -> FloatArray:
         """Input map g = [0, M^-1 tau]."""
@@ -307,6 +311,11 @@ class SurfaceVessel(AgentModel):
         turning = math.hypot(m2 * sway / math.sqrt(m1 * m3), m1 * surge / math.sqrt(m2 * m3))
         rate = float(((linear + 2.0 * quadratic * speed) / mass).max()) + turning
         return 0.9 / rate if rate > 0.0 else math.inf
+
+
+def vessel_form(model: SurfaceVessel) -> Form:
+    """The compiled form of a surface vessel, also of a subclass whose own drift goes beyond it."""
+    return Form(VESSEL, (*model.mass, *model.linear_drag, *model.quadratic_drag))
 
 
 MODELS: dict[str, type[AgentModel]] = {

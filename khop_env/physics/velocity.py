@@ -11,12 +11,10 @@ from collections.abc import Callable
 import numpy as np
 
 from khop_env.physics.agent_model import AgentModel, FloatArray
-from khop_env.physics.models import DoubleIntegrator, SurfaceVessel
+from khop_env.physics.models import DoubleIntegrator, SurfaceVessel, vessel_form
+from khop_env.physics.right_hand_sides import UNICYCLE, VELOCITY_RATE, Form, evaluated, velocity_inputs
 
 VelocityController = Callable[..., FloatArray]
-
-VELOCITY_RATE = 2.0  # 1/s: decay rate of the velocity error where the input is a force or an acceleration
-OFFSET = 0.3  # m ahead of a unicycle's axle: the point whose velocity is commanded
 
 
 def _direct(model: AgentModel, x: FloatArray, velocity: FloatArray) -> FloatArray:
@@ -32,17 +30,12 @@ def _double_integrator(model: DoubleIntegrator, x: FloatArray, velocity: FloatAr
 
 def _unicycle(model: AgentModel, x: FloatArray, velocity: FloatArray) -> FloatArray:
     """Feedback linearisation about the point OFFSET ahead (d'Andrea-Novel, Campion and Bastin, 1995)."""
-    cos, sin = np.cos(x[..., 2]), np.sin(x[..., 2])
-    vx, vy = velocity[..., 0], velocity[..., 1]
-    return np.stack([cos * vx + sin * vy, (cos * vy - sin * vx) / OFFSET], axis=-1)
+    return evaluated(velocity_inputs, Form(UNICYCLE), 2, x[..., :3], velocity)
 
 
 def _vessel(model: SurfaceVessel, x: FloatArray, velocity: FloatArray) -> FloatArray:
     """Body velocities follow the rotated command and the yaw rate is damped; drag helps, so it isn't cancelled."""
-    cos, sin = np.cos(x[..., 2]), np.sin(x[..., 2])
-    vx, vy = velocity[..., 0], velocity[..., 1]
-    wanted = np.stack([cos * vx + sin * vy, cos * vy - sin * vx, np.zeros_like(vx)], axis=-1)
-    return np.array(model.mass) * VELOCITY_RATE * (wanted - x[..., 3:])
+    return evaluated(velocity_inputs, vessel_form(model), 3, x[..., :6], velocity)
 
 
 VELOCITY_CONTROLLERS: dict[str, VelocityController] = {

@@ -2,6 +2,7 @@
 
 from khop_env.simulation.arena import Arena, Obstacle
 from khop_env.simulation.dense_output import DenseOutput
+from khop_env.simulation.edge_law import EdgeLaw
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant
 from khop_env.simulation.simulator import Simulator
@@ -13,6 +14,7 @@ __all__ = [
     "OBSERVE",
     "Arena",
     "DenseOutput",
+    "EdgeLaw",
     "FleetPlant",
     "InitialSet",
     "Law",

@@ -12,7 +12,7 @@ import numpy as np
 
 from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray
-from khop_env.simulation.step_control import GAMMA, StepControl
+from khop_env.simulation.step_control import StepControl
 
 if TYPE_CHECKING:
     from khop_env.simulation.simulator import Simulator
@@ -24,9 +24,9 @@ _MOST_NUMBERS = 1_000_000  # estimates of such a batch
 class DenseOutput:
     """Samples of a run of one environment at given times, within the steps that `StepControl` takes.
 
-    States follow the step's own polynomial of degree 2. Estimates' errors over the funnel's width follow the straight
-    line between the ends of the step, so that |xi| / rho is at most that at one of the ends. The law is evaluated at
-    each sample.
+    States follow a polynomial of degree 3 (`StepControl.states_at`). Estimates' errors over the funnel's width follow
+    the straight line between the ends of the step, so that |xi| / rho is at most that at one of the ends. The law is
+    evaluated at each sample.
 
     Args:
         control: of a simulator of one environment; its next step is the first.
@@ -46,8 +46,7 @@ class DenseOutput:
         self._inside = [np.zeros((each.size, self._samples.num_envs)) for each in self._layouts]
         self._filled = 0
         self._note_end()
-        none, x = np.zeros(0), simulator.state.x  # compiles the rest
-        _along(none, 0, 0.0, x, x, x, x, self._samples.state.x)
+        none = np.zeros(0)  # compiles the rest
         for ends, inside in zip(self._ends, self._inside, strict=True):
             _between(none, 0, ends, inside)
         self._complete()
@@ -60,14 +59,12 @@ class DenseOutput:
         """
         control, state = self._control, self._samples.state
         self._note_end()
-        now = control.simulator.state
+        end = control.simulator.state.t[0]
         while len(times):
             start, some = self._filled, times[: self._samples.num_envs - self._filled]
             state.t[start : start + len(some)] = some
-            share = np.minimum((some - control.before.t[0]) / control.last, 1.0)
-            share[some == now.t[0]] = 1.0
-            rate, next_rate = control.simulator.plant.rates
-            _along(share, start, control.last, control.before.x, rate, next_rate, now.x, state.x)
+            share = np.minimum(1.0 - (end - some) / control.last, 1.0)
+            control.states_at(share, control.last, start, state.x)
             for ends, inside in zip(self._ends, self._inside, strict=True):
                 _between(share, start, ends, inside)
             self._filled += len(some)
@@ -103,25 +100,6 @@ class DenseOutput:
             estimate = state.memory[("estimate", "input_estimate")[kind]]
             columns = layout.column_source, layout.column_row
             _errors(*columns, (state.x, state.g)[kind], widths.at(state.t), estimate, ends)
-
-
-@compiled
-def _along(
-    share: FloatArray,
-    start: int,
-    size: float,
-    x: FloatArray,
-    rate: FloatArray,
-    next_rate: FloatArray,
-    end: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write states at shares of a step of one environment, from the column `start` on."""
-    for c in range(x.shape[0]):
-        for k in range(share.size):
-            bent = 0.5 * share[k] / GAMMA * (next_rate[c, 0] - rate[c, 0])
-            inside = x[c, 0] + share[k] * size * (rate[c, 0] + bent)
-            out[c, start + k] = end[c, 0] if share[k] == 1.0 else inside
 
 
 @compiled

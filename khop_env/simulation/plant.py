@@ -12,10 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from khop_env.compiled import compiled, place
 from khop_env.elementary import all_finite, weighted_sum
 from khop_env.observers import FloatArray, PlantState, SolveError
 from khop_env.physics import Fleet, read_only
+from khop_env.physics.disturbance import AttachedDisturbance
+from khop_env.physics.right_hand_sides import drifts, input_maps
+from khop_env.physics.waveforms import disturb
+from khop_env.simulation.edge_law import HELD, EdgeArrays, EdgeLaw, compiled_form, has_compiled_controllers
 from khop_env.simulation.view import Law, ViewBuilder
+from khop_env.threads import Range, Threads
+
+_HELD: tuple[Any, ...] = tuple(EdgeLaw(HELD))
 
 MOST_PARTS = 10_000
 """Steps of the integrator that one `Simulator.step` may be divided into."""
@@ -31,6 +39,13 @@ class FleetPlant:
         law: the feedback law, or None for inputs that are held.
         views: builds the law's view; needed with a law.
         saturated: whether inputs have to be within the models' limits: a law's are clipped, others refused.
+        threads: that share the batch.
+
+    Attributes:
+        compiled: whether models, disturbance and law are the library's own, with a compiled form.
+        runs: the fields of `physics.right_hand_sides.Runs` of all agents; None where a model is Python.
+        terms: those of `physics.waveforms.TermArrays`; None where a disturbance is Python.
+        edges: of the law.
     """
 
     def __init__(
@@ -41,19 +56,28 @@ class FleetPlant:
         law: Law | None,
         views: ViewBuilder | None,
         saturated: bool = False,
+        threads: Threads | None = None,
     ) -> None:
         self.fleet, self.num_envs = fleet, num_envs
         self.disturbance, self.law, self.views = disturbance, law, views
+        self.threads = threads or Threads(1)
+        self._ranges = self.threads.ranges(num_envs)
         self._limit = fleet.input_limit[:, None] if saturated else None
         self._rates: tuple[FloatArray, ...] = ()
+        self._stacked = np.zeros((0, fleet.n, num_envs))
+        attached = AttachedDisturbance((), fleet) if disturbance is None else disturbance
+        self.runs, self.terms = fleet.runs, getattr(attached, "arrays", None)
+        edges = None if views is None else views.edge_arrays()
+        self.edges = EdgeArrays.none(fleet) if edges is None else edges
+        own_law = law is not None and (
+            edges is None or not has_compiled_controllers(fleet) or compiled_form(law) is None
+        )
+        self._form: object = None
+        self._law: tuple[Any, ...] = _HELD
+        self.compiled = self.runs is not None and self.terms is not None and not own_law
         self._states = self._inputs = self._effects = self._drawn = np.zeros((0, 0))
         self._t = np.zeros(0)
         self._w = np.zeros((fleet.n, num_envs)).T  # (B, n) in the memory order of the states
-
-    @property
-    def rates(self) -> tuple[FloatArray, ...]:
-        """(n, B) rates at the stages of the last step, from its beginning on."""
-        return self._rates
 
     def rate(self, state: PlantState, out: FloatArray) -> None:
         """Write x' = f(x) + g + w(x, t) into `out` (n, B)."""
@@ -69,12 +93,41 @@ class FleetPlant:
         Raises:
             SolveError: if a state isn't finite.
         """
-        if len(self._rates) <= number:
-            self._rates = (*self._rates, np.zeros((self.fleet.n, self.num_envs)))
-        self.rate(state, self._rates[number])
-        np.add(before.t, elapsed, out=state.t)
-        weighted_sum(before.x, weights, self._rates[: number + 1], state.x)
-        require_finite(state.x, self.fleet)
+        rates = self.rates_of(number + 1)
+        if self.runs is None or self.terms is None:
+            self.rate(state, rates[number])
+            np.add(before.t, elapsed, out=state.t)
+            weighted_sum(before.x, weights, tuple(rates[: number + 1]), state.x)
+            require_finite(state.x, self.fleet)
+            return
+        arrays = before.t, before.x, state.t, state.x, state.g, rates, self._w.T
+        common = self.runs, self.terms, state.drawn, number, elapsed, weights, *arrays
+
+        def part(range_: Range) -> bool:
+            return advance_plant(*common, *range_)
+
+        if not all(self.threads.run(part, self._ranges)):
+            require_finite(state.x, self.fleet)
+
+    def rates_of(self, stages: int) -> FloatArray:
+        """(stages or more, n, B) x' at the stage before each stage of the last step."""
+        if len(self._stacked) < stages:
+            grown = np.zeros((stages, self.fleet.n, self.num_envs))
+            grown[: len(self._stacked)] = self._stacked
+            self._stacked = grown
+            self._rates = tuple(self._stacked)
+        return self._stacked
+
+    def edge_law(self) -> tuple[Any, ...]:
+        """The law's compiled form with its parameters as they are now, the fields of `EdgeLaw`."""
+        if self.law is None:
+            return _HELD
+        form = self.law.edge_law()  # type: ignore[attr-defined]
+        if form != self._form:
+            direct = self.law.is_input(self.fleet, int(self.edges.edges.max(initial=0)))  # type: ignore[attr-defined]
+            kind, gain, second, cancel, _ = form
+            self._form, self._law = form, (int(kind), float(gain), float(second), bool(cancel), not direct)
+        return self._law
 
     def actuate(self, state: PlantState) -> None:
         """Write the law's inputs into `state.u` (m, B), without a law leave the held ones there; then g(x, u).
@@ -82,8 +135,8 @@ class FleetPlant:
         Raises:
             ValueError: if the law returns inputs of a wrong shape.
         """
-        states = self._bind(state)
         if self.law is not None:
+            self._bind(state)
             assert self.views is not None
             u = self.law(self._t, self.views.update(state))
             if np.shape(u) != (self.num_envs, self.fleet.m):
@@ -94,11 +147,15 @@ class FleetPlant:
             state.u.T[:] = u
             if self._limit is not None:
                 np.clip(state.u, -self._limit, self._limit, out=state.u)
-        self.fleet.input_map(self._t, states, self._inputs, self._effects)
+        self.effect(state)
 
     def effect(self, state: PlantState) -> None:
         """Write g(x, u) of the inputs in force."""
-        self.fleet.input_map(self._t, self._bind(state), self._inputs, self._effects)
+        if self.runs is None:
+            self.fleet.input_map(self._t, self._bind(state), self._inputs, self._effects)
+            return
+        common = self.runs, state.x, state.u, state.g
+        self.threads.run(lambda range_: input_maps(*common, *range_), self._ranges)
 
     def checked_inputs(self, u: ArrayLike) -> FloatArray:
         """Inputs (m,) or (B, m) that are to be held, checked.
@@ -135,6 +192,79 @@ class FleetPlant:
             self._t, self._drawn = read_only(state.t[:]), read_only(state.drawn[:])
             self._effects = state.g.T
         return self._states
+
+
+@compiled
+def advance_plant(
+    runs: Any,
+    terms: Any,
+    drawn: FloatArray,
+    number: int,
+    elapsed: float,
+    weights: FloatArray,
+    t0: FloatArray,
+    x0: FloatArray,
+    t: FloatArray,
+    x: FloatArray,
+    g: FloatArray,
+    rates: FloatArray,
+    w: FloatArray,
+    low: int,
+    high: int,
+) -> bool:
+    """`FleetPlant.stage` in the environments low to high - 1.
+
+    Args:
+        runs: the fields of `physics.right_hand_sides.Runs`, of all agents.
+        terms: those of `physics.waveforms.TermArrays`.
+        drawn: (B, K) the disturbance's random numbers.
+        number: of the stage.
+        elapsed: its time after the beginning of the step, in s.
+        weights: (number + 1 or more,) of the rates so far, in s.
+        t0: (B,) time at the beginning.
+        x0: (n, B) states there.
+        t: (B,) time of the stage before, overwritten with that of the stage.
+        x: (n, B) states, likewise.
+        g: (n, B) effect of the inputs at the stage before.
+        rates: (stages, n, B) x'; that of this number is written.
+        w: (n, B) scratch.
+        low: first environment.
+        high: one past the last.
+
+    Returns:
+        Whether all states are finite.
+    """
+    rate, width = rates[number], high - low
+    drifts(runs, x, rate, low, high)
+    for row in range(g.shape[0]):
+        for e in range(width):
+            rate[row, place(low + e)] += g[row, place(low + e)]
+    if terms[0].size:
+        disturb(terms, t, x, drawn, w, low, high)
+        for row in range(w.shape[0]):
+            for e in range(width):
+                rate[row, place(low + e)] += w[row, place(low + e)]
+    for e in range(low, high):
+        t[e] = t0[e] + elapsed
+    combine(x0, weights, number + 1, rates, x, low, high)
+    total = 0.0
+    for row in range(x.shape[0]):
+        for e in range(width):
+            total += 0.0 * x[row, place(low + e)]  # 0, or NaN once and for all
+    return total == 0.0
+
+
+@compiled
+def combine(
+    base: FloatArray, weights: FloatArray, count: int, terms: FloatArray, out: FloatArray, low: int, high: int
+) -> None:
+    """Write base + sum of weights[k] terms[k], k below `count`, into the columns low to high - 1 of `out`."""
+    for row in range(base.shape[0]):
+        for e in range(high - low):
+            out[row, place(low + e)] = base[row, place(low + e)]
+        for k in range(count):
+            for e in range(high - low):
+                out[row, place(low + e)] += weights[k] * terms[k, row, place(low + e)]
 
 
 def require_finite(x: FloatArray, fleet: Fleet) -> None:

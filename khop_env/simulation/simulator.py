@@ -23,12 +23,14 @@ from khop_env.observers import (
     Proximal,
     SolveError,
 )
+from khop_env.simulation.compiled_step import compiled_step
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
 from khop_env.simulation.readings import Readings
 from khop_env.simulation.state import SimulatorState
 from khop_env.simulation.step_control import StepControl, StepCount
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
+from khop_env.threads import Threads
 
 _WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
 
@@ -50,6 +52,7 @@ class Simulator(Readings):
 
     Attributes:
         state: all arrays that a step reads and writes, batch last.
+        before: the state at the beginning of the last step.
         observers: this simulator's own copy.
         longest_step: longest step in s that all drifts take (`AgentModel.explicit_step`); inf if they take any.
         running_extremes: the arrays that `extremes` copies; overwritten by steps.
@@ -87,7 +90,8 @@ class Simulator(Readings):
         self.observers.prepare(design, num_envs, Assumptions(initial.center, initial.radius, pushed))
         self.task_graph = nx.empty_graph(len(self.fleet)) if task is None else task
         views = None if law is None else ViewBuilder(design, self.observers, self.task_graph, observe, num_envs)
-        self.plant = FleetPlant(self.fleet, num_envs, attached, law, views, saturated=self.observers.by_messages)
+        threads, saturated = Threads(getattr(self.observers, "threads", 1)), self.observers.by_messages
+        self.plant = FleetPlant(self.fleet, num_envs, attached, law, views, saturated=saturated, threads=threads)
         self.state = SimulatorState(
             t=np.zeros(num_envs),
             x=np.zeros((self.fleet.n, num_envs)),
@@ -96,7 +100,8 @@ class Simulator(Readings):
             drawn=np.zeros((num_envs, 0 if attached is None else attached.draws)),
             memory=self.observers.allocate(),
         )
-        self._before, self._interrupted = self.state.copy(), False
+        self.before, self._interrupted = self.state.copy(), False
+        self._compiled = compiled_step(self.plant, self.observers, self.state, self.before)
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach = np.abs(initial.center) + initial.radius
         self.longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
@@ -178,8 +183,8 @@ class Simulator(Readings):
     def advance(self, until: float, *, tolerance: float, u: ArrayLike | None = None) -> StepCount:
         """Advance every environment to a time, in steps that are as long as their estimated errors allow.
 
-        For the proximal step of order 2. All environments take the same steps, so that they have to be at the same
-        time, and an environment's result depends on the others, within the tolerance.
+        For the proximal step of order 2 or 3; order 3 takes the fewest steps. All environments take the same ones, so
+        that they have to be at the same time, and an environment's result depends on the others, within the tolerance.
 
         Args:
             until: time since reset in s, not before the present.
@@ -229,20 +234,37 @@ class Simulator(Readings):
             parts: `parts_of(dt)`.
         """
         self._require_whole()
-        state, before, copied = self.state, self._before, self.observers.copied
+        state, before, copied = self.state, self.before, self.observers.copied
         whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
         start = state.copy() if parts > 1 else before
-        state.copy_step(before, copied)
+        self.keep()
         try:
             for part in range(parts):
                 if part:
-                    state.copy_step(before, copied)
-                self.observers.advance(self.plant, before, state, dt / parts)
-                self.observers.raise_extremes(state, self.running_extremes)
+                    self.keep()
+                self.one_step(dt / parts)
         except BaseException as error:
             start.copy_step(state, whole)
             self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
             raise
+
+    def keep(self) -> None:
+        """Make `before` the present state, unless the compiled step does; for callers of `one_step`."""
+        if self._compiled is None:
+            self.state.copy_step(self.before, self.observers.copied)
+
+    def one_step(self, dt: float) -> None:
+        """Advance from `before`, the present state, by a single step of `dt` seconds, and raise the extremes.
+
+        Raises:
+            FunnelError: as `step`; the state is undefined then, and `before` is as it was.
+            SolveError: likewise.
+        """
+        if self._compiled is not None:
+            self._compiled(dt, self.running_extremes)
+        else:
+            self.observers.advance(self.plant, self.before, self.state, dt)
+            self.observers.raise_extremes(self.state, self.running_extremes)
 
     def warm_up(self) -> None:
         """Compile all code that a step runs; the state is unchanged."""

@@ -9,9 +9,9 @@ import networkx as nx
 import numpy as np
 
 from khop_env.brief import brief
-from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray, ObserverDesign, Observers, PlantState
 from khop_env.physics import Fleet, read_only
+from khop_env.simulation.edge_law import EdgeArrays, displacements
 from khop_env.simulation.received import ReceivedStates, links_up
 
 Observe = Literal["estimate", "oracle", "local"]
@@ -110,10 +110,11 @@ class ViewBuilder:
             displacement=read_only(self._columns.transpose(2, 0, 1)),
         )
 
-    @property
-    def sources(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Per edge the sources of the compiled loop: kind of value (E,), rows of own and of other position (E, d)."""
-        return self._kind, self._own, self._other
+    def edge_arrays(self) -> EdgeArrays | None:
+        """Edges and sources for the compiled loop; None where sources change with links."""
+        if self._received is not None:
+            return None
+        return EdgeArrays.of(self.view.fleet, self.view.edges, self._kind, self._own, self._other)
 
     def update(self, state: PlantState) -> View:
         """The view at a state."""
@@ -122,7 +123,7 @@ class ViewBuilder:
         if self._received is not None:
             up = links_up(self._design, self._observers, state)
             estimate = self._received.states(state, up)
-        displacements(self._kind, self._own, self._other, x, estimate, self._columns)
+        displacements(self._kind, self._own, self._other, x, estimate, self._columns, 0, x.shape[1])
         if up is not None:
             self._known[self._gated] = known = up[self._link]
             self._columns[self._gated] = np.where(known[:, None], self._columns[self._gated], 0.0)
@@ -135,21 +136,3 @@ class ViewBuilder:
         if view.known.base is not self._known:
             view.known = read_only(self._known.T)
         return view
-
-
-@compiled
-def displacements(
-    kind: IntArray, own: IntArray, other: IntArray, x: FloatArray, estimate: FloatArray, out: FloatArray
-) -> None:
-    """Write (E, d, B) displacements along task edges: kind 0 reads the state, 1 an estimate, 2 writes nothing."""
-    for edge in range(kind.size):
-        if kind[edge] == 2:
-            continue
-        for c in range(own.shape[1]):
-            own_row, other_row = own[edge, c], other[edge, c]
-            if kind[edge] == 1:
-                for env in range(x.shape[1]):
-                    out[edge, c, env] = estimate[other_row, env] - x[own_row, env]
-            else:
-                for env in range(x.shape[1]):
-                    out[edge, c, env] = x[other_row, env] - x[own_row, env]

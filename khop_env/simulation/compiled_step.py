@@ -1,0 +1,402 @@
+"""A whole step of plant and observers in one compiled call, where everything in it is the library's own.
+
+It is `Proximal.advance`, `FleetPlant` and `FunnelObservers.raise_extremes` with the same operations in the same order,
+so that the results are theirs to the bit (tests/simulation/test_compiled_step.py). Everything happens in a range of
+environments, so that threads share a batch, and block by block, so that the arrays of a block stay in the cache.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from khop_env.compiled import compiled, numba, place
+from khop_env.observers import Extremes, FloatArray, IntArray, Observers, Proximal
+from khop_env.observers.disagreement import largest_ratios
+from khop_env.observers.performance import exponentials
+from khop_env.observers.solve import solve
+from khop_env.physics.right_hand_sides import drifts, input_maps
+from khop_env.simulation.edge_law import HELD, command_inputs
+from khop_env.simulation.plant import FleetPlant, advance_plant, combine, require_finite
+from khop_env.simulation.state import SimulatorState
+from khop_env.threads import Range
+
+BLOCK = 128  # environments: enough to fill vector registers, few enough for the cache
+_STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
+
+
+class Values(NamedTuple):
+    """The arrays of a `SimulatorState` that a step changes.
+
+    Attributes:
+        t: (B,) time in s.
+        x: (n, B) states.
+        u: (m, B) inputs.
+        g: (n, B) their effect.
+        estimate: (P, B) estimates of states.
+        input_estimate: (Q, B) estimates of the inputs' effects.
+        eps: (P, B) transformed disagreements.
+        nu: (Q, B) those of the input observers.
+    """
+
+    t: FloatArray
+    x: FloatArray
+    u: FloatArray
+    g: FloatArray
+    estimate: FloatArray
+    input_estimate: FloatArray
+    eps: FloatArray
+    nu: FloatArray
+
+    @classmethod
+    def of(cls, state: SimulatorState) -> Values:
+        """Of a state; its arrays themselves."""
+        memory = (state.memory[name] for name in ("estimate", "input_estimate", "eps", "nu"))
+        return cls(state.t, state.x, state.u, state.g, *memory)
+
+
+class System(NamedTuple):
+    """The equations of a step; fields that are tuples are those of the named tuples that they are called after.
+
+    Attributes:
+        runs: all agents, of `physics.right_hand_sides.Runs`.
+        estimates: the estimates whose observers know the drift, likewise.
+        input_runs: (3, K) estimates with an input observer: first row, the same among the input estimates, number.
+        all_drifts: whether `estimates` are all estimates.
+        terms: of the disturbance, `physics.waveforms.TermArrays`.
+        edges: of the law, `EdgeArrays`.
+        states: the pairs of the state observers, `PairArrays`.
+        inputs: those of the input observers.
+        rho: the funnels' coefficients of the state observers.
+        omega: those of the input observers.
+        state_sums: (pairs,) [M_i^-1 1]_a of the state observers.
+        input_sums: likewise of the input observers.
+    """
+
+    runs: Any
+    estimates: Any
+    input_runs: IntArray
+    all_drifts: bool
+    terms: Any
+    edges: Any
+    states: Any
+    inputs: Any
+    rho: Any
+    omega: Any
+    state_sums: FloatArray
+    input_sums: FloatArray
+
+
+class Work(NamedTuple):
+    """Arrays that a step fills: the stages' rates, and scratch.
+
+    Attributes:
+        rates: (stages, n, B) x' at the stage before.
+        predicted: (stages, P, B) f(x_hat) + g_hat there.
+        slopes: (stages, P, B) corrections of the state observers at the stage.
+        input_slopes: (stages, Q, B) those of the input observers.
+        w: (n, B) disturbance.
+        rho: (rows, B) funnels of the state observers.
+        omega: those of the input observers.
+        terms: (E, d, B) of the law.
+        velocity: (N * d, B) likewise.
+        drift: (n, B) likewise.
+    """
+
+    rates: FloatArray
+    predicted: FloatArray
+    slopes: FloatArray
+    input_slopes: FloatArray
+    w: FloatArray
+    rho: FloatArray
+    omega: FloatArray
+    terms: FloatArray
+    velocity: FloatArray
+    drift: FloatArray
+
+
+class CompiledStep:
+    """Advances a simulator's state by one step of the proximal scheme; made by `compiled_step`.
+
+    Args:
+        plant: without Python in it.
+        observers: prepared.
+        state: advanced in place.
+        before: gets the state at the beginning of each step.
+    """
+
+    def __init__(self, plant: FleetPlant, observers: Proximal, state: SimulatorState, before: SimulatorState) -> None:
+        design, fleet, batch = observers.design, plant.fleet, plant.num_envs
+        self._plant, self._observers, self._state = plant, observers, state
+        self._ranges = plant.threads.ranges(batch)
+        states, inputs, edges = design.states, design.inputs, plant.edges
+        self._system = tuple(
+            System(
+                plant.runs,
+                *observers.prediction.compiled_runs(),
+                plant.terms,
+                tuple(edges),
+                tuple(states.layout.packed),
+                tuple(inputs.layout.packed),
+                states.rho.coefficients,
+                inputs.rho.coefficients,
+                states.layout.inverse_row_sums,
+                inputs.layout.inverse_row_sums,
+            )
+        )
+        self._work = Work(
+            plant.rates_of(observers.stages.predicted.shape[0]),
+            *observers.stages,
+            np.zeros((fleet.n, batch)),
+            np.zeros((len(states.rho), batch)),
+            np.zeros((len(inputs.rho), batch)),
+            np.zeros((*edges.own.shape, batch)),
+            np.zeros((fleet.position_index.size, batch)),
+            np.zeros((fleet.n, batch)),
+        )
+        self._arrays = tuple(Values.of(state)), tuple(Values.of(before)), state.drawn, tuple(self._work)
+
+    def __call__(self, dt: float, extremes: Extremes) -> None:
+        """Advance by `dt` seconds, and raise the running maxima `extremes`.
+
+        Raises:
+            SolveError: if a number isn't finite; the state is undefined then.
+        """
+        observers, state, work = self._observers, self._state, self._work
+        common = (self._system, self._plant.edge_law(), *observers.scheme(dt), *self._arrays, tuple(extremes))
+
+        def part(range_: Range) -> tuple[int, int, int, int]:
+            return step(*common, *range_)
+
+        for failure, evaluations, env, target in self._plant.threads.run(part, self._ranges):
+            if failure == _STATE:
+                require_finite(state.x, self._plant.fleet)
+            of_inputs = failure == _INPUTS
+            funnels = observers.design.inputs if of_inputs else observers.design.states
+            source, rho = (state.g, work.omega) if of_inputs else (state.x, work.rho)
+            observers.account([(evaluations, env, target)], funnels, source, rho)
+
+
+def compiled_step(
+    plant: FleetPlant, observers: Observers, state: SimulatorState, before: SimulatorState
+) -> CompiledStep | None:
+    """The compiled step, or None where Python is needed: for models, disturbances, laws or funnels of a user, or links
+    that come and go.
+    """
+    if type(observers) is not Proximal or observers.links is not None or not plant.compiled or numba is None:
+        return None
+    design = observers.design
+    known = observers.prediction.compiled_runs()[0] is not None
+    return (
+        CompiledStep(plant, observers, state, before)
+        if known and design.states.rho.exponential and design.inputs.rho.exponential
+        else None
+    )
+
+
+@compiled
+def step(
+    system: Any,
+    law: Any,
+    nodes: FloatArray,
+    explicit: FloatArray,
+    implicit: FloatArray,
+    now: Any,
+    before: Any,
+    drawn: FloatArray,
+    work: Any,
+    extremes: Any,
+    low: int,
+    high: int,
+) -> tuple[int, int, int, int]:
+    """One step in the environments low to high - 1.
+
+    Args:
+        system: the fields of `System`.
+        law: those of `EdgeLaw`; HELD for inputs that are held.
+        nodes: (stages,) times of the stages after the beginning, in s.
+        explicit: (stages, stages) weights of the rates, in s.
+        implicit: (stages, stages) of the corrections, in s.
+        now: the fields of `Values`, advanced.
+        before: likewise, overwritten with the state at the beginning.
+        drawn: (B, K) the disturbance's random numbers.
+        work: the fields of `Work`.
+        extremes: those of `Extremes`.
+        low: first environment.
+        high: one past the last.
+
+    Returns:
+        What failed, if anything (_STATE, _STATES or _INPUTS), and then as `solve`.
+    """
+    evaluations = 0
+    for first in range(low, high, BLOCK):
+        failure, count, env, target = advance_block(
+            system, law, nodes, explicit, implicit, now, before, drawn, work, first, min(first + BLOCK, high)
+        )
+        evaluations += count
+        if failure > 0:
+            return failure, evaluations, env, target
+        raise_block(system, now, work, extremes, first, min(first + BLOCK, high))
+    return 0, evaluations, -1, -1
+
+
+@compiled
+def advance_block(
+    system: Any,
+    law: Any,
+    nodes: FloatArray,
+    explicit: FloatArray,
+    implicit: FloatArray,
+    now: Any,
+    before: Any,
+    drawn: FloatArray,
+    work: Any,
+    low: int,
+    high: int,
+) -> tuple[int, int, int, int]:
+    """`step` for a block of environments, without the running maxima."""
+    system, now, before, work = System(*system), Values(*now), Values(*before), Work(*work)
+    keep(now, before, low, high)
+    batch, evaluations, observed = (low, high), 0, system.inputs[0].size
+    for s in range(nodes.size):
+        predict(system, now, work.predicted[s], low, high)
+        if not advance_plant(
+            system.runs,
+            system.terms,
+            drawn,
+            s,
+            nodes[s],
+            explicit[s],
+            before.t,
+            before.x,
+            now.t,
+            now.x,
+            now.g,
+            work.rates,
+            work.w,
+            low,
+            high,
+        ):
+            return _STATE, evaluations, -1, -1
+        combine(before.estimate, explicit[s], s + 1, work.predicted, now.estimate, low, high)
+        combine(now.estimate, implicit[s], s, work.slopes, now.estimate, low, high)
+        exponentials(now.t, system.rho[0], system.rho[1], system.rho[2], work.rho, low, high)
+        count, env, target = solve(
+            system.states,
+            implicit[s, s],
+            now.estimate,
+            now.x,
+            work.rho,
+            now.eps,
+            now.estimate,
+            work.slopes[s],
+            batch,
+            (0, system.states[0].size),
+        )
+        evaluations += count
+        if env >= 0:
+            return _STATES, evaluations, env, target
+        if law[0] != HELD:
+            command_inputs(
+                law,
+                system.edges,
+                system.runs,
+                now.x,
+                now.estimate,
+                now.u,
+                work.terms,
+                work.velocity,
+                work.drift,
+                low,
+                high,
+            )
+        input_maps(system.runs, now.x, now.u, now.g, low, high)
+        if observed:
+            if s:
+                combine(before.input_estimate, implicit[s], s, work.input_slopes, now.input_estimate, low, high)
+            exponentials(now.t, system.omega[0], system.omega[1], system.omega[2], work.omega, low, high)
+            count, env, target = solve(
+                system.inputs,
+                implicit[s, s],
+                now.input_estimate,
+                now.g,
+                work.omega,
+                now.nu,
+                now.input_estimate,
+                work.input_slopes[s],
+                batch,
+                (0, observed),
+            )
+            evaluations += count
+            if env >= 0:
+                return _INPUTS, evaluations, env, target
+    return 0, evaluations, -1, -1
+
+
+@compiled
+def keep(now: Any, before: Any, low: int, high: int) -> None:
+    """Copy `Values` of a block."""
+    now, before = Values(*now), Values(*before)
+    for e in range(low, high):
+        before.t[e] = now.t[e]
+    copy_block(now.x, before.x, low, high)
+    copy_block(now.u, before.u, low, high)
+    copy_block(now.g, before.g, low, high)
+    copy_block(now.estimate, before.estimate, low, high)
+    copy_block(now.input_estimate, before.input_estimate, low, high)
+    copy_block(now.eps, before.eps, low, high)
+    copy_block(now.nu, before.nu, low, high)
+
+
+@compiled
+def copy_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
+    """Copy the columns low to high - 1."""
+    for row in range(values.shape[0]):
+        for e in range(high - low):
+            out[row, place(low + e)] = values[row, place(low + e)]
+
+
+@compiled
+def predict(system: Any, now: Any, out: FloatArray, low: int, high: int) -> None:
+    """`Prediction.rate`: f(x_hat) + g_hat."""
+    system, now = System(*system), Values(*now)
+    if not system.all_drifts:
+        for row in range(out.shape[0]):
+            for e in range(high - low):
+                out[row, place(low + e)] = 0.0
+    drifts(system.estimates, now.estimate, out, low, high)
+    for run in range(system.input_runs.shape[1]):
+        to, source = system.input_runs[0, run], system.input_runs[1, run]
+        for q in range(system.input_runs[2, run]):
+            for e in range(high - low):
+                out[to + q, place(low + e)] += now.input_estimate[source + q, place(low + e)]
+
+
+@compiled
+def raise_block(system: Any, now: Any, work: Any, extremes: Any, low: int, high: int) -> None:
+    """`FunnelObservers.raise_extremes`."""
+    system, now, work, extremes = System(*system), Values(*now), Work(*work), Extremes(*extremes)
+    largest_ratios(
+        system.states,
+        now.estimate,
+        now.x,
+        work.rho,
+        system.state_sums,
+        extremes.normalized,
+        extremes.relative,
+        low,
+        high,
+    )
+    if system.inputs[0].size:
+        largest_ratios(
+            system.inputs,
+            now.input_estimate,
+            now.g,
+            work.omega,
+            system.input_sums,
+            extremes.input_normalized,
+            extremes.input_relative,
+            low,
+            high,
+        )

@@ -1,0 +1,140 @@
+"""The step in one compiled call: the bits of the Python loop, and the loop wherever something of a user's is in it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agents import FormationLaw, LeaderFollowingLaw, LinearConsensus, TanhConsensus, make_law
+from khop_env.observers import Exponential, Proximal, SolveError
+from khop_env.observers.performance import Scaled
+from khop_env.physics import VELOCITY_CONTROLLERS, DriftingIntegrator, Sinusoid
+from khop_env.scenarios import Scenario, mixed_fleet, paper
+from khop_env.simulation import Simulator
+from tests.strategies import SmoothSignals, System, systems
+
+LAWS = {
+    "held": lambda: None,
+    "tanh": lambda: TanhConsensus(1.5),
+    "linear": lambda: LinearConsensus(1.5, cancel_drift=True),
+    "formation": lambda: FormationLaw(1.5, speed=0.4),
+    "formation with drift": lambda: FormationLaw(1.5, speed=0.4, cancel_drift=False),
+    "leader following": lambda: LeaderFollowingLaw(1.5, shrink=0.8),
+}
+
+
+class Drifter(DriftingIntegrator):
+    """A user's model: equal in all but its class."""
+
+    def drift(self, t, x):
+        """That of its base class."""
+        return super().drift(t, x)
+
+
+class Breeze(Sinusoid):
+    """A user's disturbance, likewise."""
+
+
+def with_a_drifter(scenario: Scenario) -> Scenario:
+    """The scenario with a user's model in the place of agent 3's."""
+    models = tuple(Drifter() if i == 3 else model for i, model in enumerate(scenario.models))
+    return dataclasses.replace(scenario, models=models)
+
+
+def in_python(simulator: Simulator) -> Simulator:
+    """The same simulator, whose steps are the Python loop."""
+    simulator._compiled = None
+    return simulator
+
+
+def assert_same_run(compiled: Simulator, python: Simulator, dt: float, steps: int, jump: float = 0.0) -> None:
+    """All arrays and running maxima are equal after each step."""
+    assert compiled._compiled is not None
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        u = None if compiled.plant.law else jump * rng.uniform(-1.0, 1.0, (compiled.num_envs, compiled.fleet.m))
+        for simulator in (compiled, python):
+            simulator.step(dt, u)
+        for name, values in compiled.state.arrays().items():
+            np.testing.assert_array_equal(values, python.state.arrays()[name], err_msg=name)
+        for ours, theirs in zip(compiled.extremes, python.extremes, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@settings(max_examples=8)
+@given(system=systems(), order=st.sampled_from([1, 2]), batch=st.integers(1, 4))
+def test_it_has_the_bits_of_the_python_loop(law, system: System, order, batch):
+    """For random fleets, graphs, funnels, disturbances, laws, orders and batches."""
+    compiled, python = (system.simulator(Proximal(order), batch, law=LAWS[law]()) for _ in range(2))
+    assert_same_run(compiled, in_python(python), 0.03, 6, jump=1.0)
+    assert compiled.observers.evaluations == python.observers.evaluations
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_and_blocks_have_the_bits_of_the_python_loop(threads):
+    """Of a batch of several blocks, divided in uneven parts."""
+    for scenario, batch in ((paper(), 300), (mixed_fleet(), 135)):
+        compiled, python = (
+            scenario.build(law=make_law(scenario.law), observers=Proximal(2, threads=count), num_envs=batch)
+            for count in (threads, 1)
+        )
+        assert_same_run(compiled, in_python(python), 0.05, 3)
+
+
+def test_a_law_whose_parameters_change_is_followed():
+    scenario = paper()
+    laws = [TanhConsensus(2.0), TanhConsensus(2.0)]
+    compiled, python = (scenario.build(law=law) for law in laws)
+    assert_same_run(compiled, in_python(python), 0.02, 3)
+    for law in laws:
+        law.gain = 5.0
+    assert_same_run(compiled, python, 0.02, 3)
+
+
+@pytest.mark.parametrize("owned", ["model", "disturbance", "law", "subclass of a law", "funnel", "controller"])
+def test_what_is_a_users_goes_through_python(owned, monkeypatch):
+    """A subclass of a library's class, whose methods may differ, counts as a user's own."""
+    scenario, law = paper(), None
+    if owned == "model":
+        scenario = with_a_drifter(scenario)
+    elif owned == "disturbance":
+        scenario = dataclasses.replace(scenario, disturbance=scenario.disturbance + Breeze(0.1))
+    elif owned == "law":
+        law = SmoothSignals(scenario.build().fleet, 0)
+    elif owned == "subclass of a law":
+        law = type("Own", (TanhConsensus,), {})()
+    elif owned == "controller":
+        law = TanhConsensus()
+        monkeypatch.setitem(VELOCITY_CONTROLLERS, "drifter", lambda model, x, velocity: 0.5 * velocity)
+    elif owned == "funnel":
+        scenario = dataclasses.replace(scenario, delta=Scaled(Exponential(40.0, 1.0, 1.0), 1.0))
+    assert scenario.build(law=law)._compiled is None
+
+
+def test_a_users_model_beside_the_librarys_moves_as_theirs():
+    """A fleet with a user's model is stepped in Python: the same right-hand side gives the same bits."""
+    scenario = paper()
+    own = with_a_drifter(scenario).build()
+    library = scenario.build()
+    assert own._compiled is None
+    for _ in range(5):
+        own.step(0.05)
+        library.step(0.05)
+    np.testing.assert_array_equal(own.x, library.x)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_step_that_fails_says_why_and_changes_nothing(threads):
+    scenario = mixed_fleet()
+    simulator = scenario.build(observers=Proximal(2, threads=threads), num_envs=200)
+    simulator.step(0.02)
+    column = next(q for q, (_, name, _) in enumerate(simulator.fleet.component_names()) if name == "surge")
+    simulator.state.x[column, 150] = 1e200  # whose quadratic drag overflows
+    saved = simulator.save()
+    with pytest.raises(SolveError, match=r"environment 150: state '\w+' of 'vessel_0' became"):
+        simulator.step(0.02)
+    for name, values in simulator.state.arrays().items():
+        np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
