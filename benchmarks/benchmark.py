@@ -8,10 +8,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import platform
-import subprocess
-import sys
 import time
-import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +20,7 @@ import numpy as np
 from agents import make_law
 from benchmarks.comparison import left_out
 from benchmarks.environments import environment_rows
+from benchmarks.growth import growth_rows
 from benchmarks.networks import network_rows, violation_rows
 from benchmarks.report import Report, reason
 from benchmarks.safety import collision_rows
@@ -32,7 +30,7 @@ from benchmarks.yardsticks import CompiledPaper, bare_loop
 from khop_env.extras import how_to_install
 from khop_env.observers import FloatArray, Proximal
 from khop_env.observers.solve import solve
-from khop_env.scenarios import Scenario, paper, random_geometric
+from khop_env.scenarios import Scenario, paper
 from khop_env.simulation import Simulator
 
 DURATION = 10.0  # s, of the closed loop
@@ -40,7 +38,6 @@ ACCURACY = 2e-3  # largest admissible error of x of a method over it
 DT = 0.01
 EXPLICIT_DT = 1e-5
 BATCH = 64
-ROOT = Path(__file__).resolve().parents[1]  # of the repository
 PARTS = (
     "explicit",
     "scipy",
@@ -122,11 +119,11 @@ def benchmark(
             0.2,
             lambda: report.add("ratio_to_floor", _ratio_to_floor(quick), most=6.0),
         ),
-        Part("growth", "growth with the number of agents", 0.5, partial(_growth, report.add, quick, say)),
+        Part("growth", "growth with the number of agents", 1.0, partial(growth_rows, report.add, quick, say)),
         Part(
             "environments",
             "environments",
-            0.5 if peers is None else 3.0,
+            0.9 if peers is None else 3.4,
             partial(environment_rows, report, quick, say, peers),
         ),
         Part(
@@ -319,50 +316,6 @@ def _ratio_to_floor(quick: bool, batch: int = 1024) -> float:
         assert failed < 0
     elements = layout.size * simulator.num_envs
     return (seconds / evaluations) / (_bare_time(elements, 20) / (20 * elements))
-
-
-def _growth(add: Callable[..., None], quick: bool, say: Progress) -> None:
-    """Time and memory per pair of `random_geometric`, num_envs = 1; sizes alternate, best of several."""
-    sizes = (100, 1000) if quick else (100, 1000, 10_000)
-    simulators, pairs, held = [], [], []
-    for agents in sizes:
-        say(f"growth: {agents} agents")
-        scenario = random_geometric(agents=agents, k=2, seed=0)
-        _simulator(scenario, 1).step(DT)  # compiles, and designs the observers
-        tracemalloc.start()
-        simulators.append(_simulator(scenario, 1))
-        simulators[-1].step(DT)
-        held.append(tracemalloc.get_traced_memory()[0])
-        tracemalloc.stop()
-        pairs.append(scenario.design.states.layout.pairs)
-    seconds = np.full(len(sizes), np.inf)
-    for _ in range(3 if quick else 15):
-        for index, (agents, simulator) in enumerate(zip(sizes, simulators, strict=True)):
-            steps = max(2, 10_000 // agents)
-            seconds[index] = min(seconds[index], _best(partial(_steps, simulator, steps), 1) / steps)
-    for index, agents in enumerate(sizes):
-        add(f"step_{agents}", seconds[index] / pairs[index] * 1e9, "ns per pair and step")
-        add(f"memory_{agents}", held[index] / pairs[index], "bytes per pair")
-    for name, values in (("growth_time", seconds), ("growth_memory", held)):
-        per_pair = np.array(values) / pairs
-        add(name, per_pair.max() / per_pair.min(), most=1.5)
-    say(f"memory of a process with {sizes[-1]} agents")
-    script = f"from benchmarks.benchmark import peak_memory; print(peak_memory({sizes[-1]}))"
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
-    add(f"peak_{sizes[-1]}", float(done.stdout.split()[-1]) / 2**20, "MiB", most=1024.0)
-
-
-def _steps(simulator: Simulator, count: int) -> None:
-    for _ in range(count):
-        simulator.step(DT)
-
-
-def peak_memory(agents: int) -> int:
-    """Peak memory in bytes of this whole process, Python and graph included, once `random_geometric` has stepped."""
-    import resource
-
-    _steps(_simulator(random_geometric(agents=agents, k=2, seed=0), 1), 3)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def _machine() -> dict[str, Any]:

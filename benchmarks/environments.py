@@ -12,8 +12,10 @@ import numpy as np
 
 from benchmarks.comparison import compare, run_peer
 from benchmarks.report import Report
+from benchmarks.threads import thread_rows
 from khop_env import consensus_v0
 from khop_env.env import BatchedEnv, KHopEnv, Settings
+from khop_env.registry import make_batched
 
 BATCH = 1024
 TURNS = 5  # repetitions of both sides of a ratio
@@ -43,10 +45,10 @@ def single_rate(seconds: float, scenario: str, order: int) -> float:
 
 
 def batched(
-    scenario: str, order: int, threads: int, batch: int = BATCH, **arguments: Any
+    scenario: str, order: int, threads: int, batch: int = BATCH, environment: str = "consensus_v0", **arguments: Any
 ) -> tuple[BatchedEnv, Callable[[int], None]]:
     """A batched environment and a step with random actions that resets finished environments."""
-    env = consensus_v0.batched_env(scenario, num_envs=batch, order=order, threads=threads, **arguments)
+    env = make_batched(environment, scenario, num_envs=batch, order=order, threads=threads, **arguments)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     shape = batch, len(env.agents), 2
@@ -76,7 +78,7 @@ def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str
     for name, holder, attributes in (
         ("solve", observers, ("_solve_states", "_solve_inputs")),
         ("right-hand sides", simulator.plant, ("rate", "actuate")),
-        ("right-hand sides", observers._prediction, ("rate",)),
+        ("right-hand sides", observers.prediction, ("rate",)),
         ("observation", env, ("_read_observations",)),
     ):
         for attribute in attributes:
@@ -111,6 +113,16 @@ def environment_rows(report: Report, quick: bool, say: Callable[[str], None], pe
             for part, value in shares(env, step, 3 if quick else steps).items():
                 add(f"{kind}_{scenario}: {part}", value, "us per copy and step")
 
+    def step_of(count: int, environment: str, scenario: str, **arguments: Any) -> Callable[[int], None]:
+        return batched(scenario, 1, count, batch, environment, **arguments)[1]
+
+    cases: dict[str, Callable[[int], Callable[[int], None]]] = {
+        "threads_paper": lambda count: step_of(count, "consensus_v0", "paper"),
+        "threads_convoy": lambda count: step_of(count, "leader_following_v0", "convoy"),
+        "threads_paper_wifi": lambda count: step_of(count, "consensus_v0", "paper", network="wifi"),
+    }
+    thread_rows(report, cases, seconds / 2.0, 1 if quick else TURNS, say)
+
     def ours(scenario: str, order: int, threads: int) -> Rate:
         return lambda s: vector_rate(s, scenario, order, threads, batch)
 
@@ -126,14 +138,14 @@ def environment_rows(report: Report, quick: bool, say: Callable[[str], None], pe
         plan.append((f"vector_{scenario}_threads2", vmas, ours(scenario, 1, 2), "vmas", batch, 2, None))
         name = f"JaxMARL simple_spread, batch {batch}, a step a call: our one thread against XLA's own pool"
         plan.append((f"vector_{scenario}_jax", name, ours(scenario, 1, 1), "jaxmarl", batch, 1, 1.0))
-    for name, peer_name, rate, peer, size, threads, target in plan:
+    for name, peer_name, rate, peer, size, count, target in plan:
         say(f"environments: {name}")
         compare(
             report,
             name,
             "agent-steps/s",
             partial(rate, seconds),
-            partial(_peer_rate, peer=peer, batch=size, threads=threads, seconds=seconds),
+            partial(_peer_rate, peer=peer, batch=size, threads=count, seconds=seconds),
             (peers, peer),
             (f"x {peer_name}", target),
             1 if quick else TURNS,

@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,7 +60,7 @@ def ratio_text(value: float | None, rounding: float = 0.0) -> str:
 def _short(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"{value.dtype}[{', '.join(map(str, value.shape))}]"
-    if isinstance(value, nx.Graph):
+    if hasattr(value, "number_of_edges"):  # a graph; networkx takes a while to import
         return f"<graph of {len(value)} nodes and {value.number_of_edges()} edges>"
     if hasattr(value, "_fields"):
         return f"{type(value).__name__}(...)"  # a named tuple of arrays

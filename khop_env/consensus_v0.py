@@ -147,7 +147,7 @@ requires (Assumption 2-ii of the paper)
 `limit`: bound on positions and other states in observations, in their units, and on ages in s (default 100); larger
 values are clipped and counted in the infos
 
-`threads`: of the observers' solve (default 1); not used under a network
+`threads`: that share the environments of a batch (default 1), or "auto"; the same results with any number
 
 `network`: how messages are exchanged: a profile ("ideal", "urllc", "factory", "wifi", "lossy", "saturation", "espnow",
 "crazyradio"), also with other values ("lossy:period=0.1,loss=0.1..0.3,burst=5"), a `khop_env.network.Network` or a

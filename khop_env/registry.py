@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_type_hints
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from khop_env.catalog import ENVIRONMENTS
+from khop_env.catalog import ENVIRONMENTS, describe
+from khop_env.collection import collection_paused
 from khop_env.env import BatchedEnv, JointEnv, KHopEnv, KHopVectorEnv, Settings
 from khop_env.extras import how_to_install
 from khop_env.network import Network
 from khop_env.objects import is_object_name, load_object
 from khop_env.observers import Networked, Observers, Proximal
 from khop_env.physics import did_you_mean
-from khop_env.scenarios.named import SCENARIOS, describe, parameters_from_text, scenario, scenarios
+from khop_env.scenarios.named import SCENARIOS, parameters_from_text, scenario, scenarios
 from khop_env.scenarios.scenario import Scenario
 from khop_env.tasks import Task
 
@@ -120,11 +121,12 @@ def make_batched(
     chosen = _chosen_scenario(task.default_scenario if scenario is None else scenario)
     if isinstance(task, type):
         task = task(**{name: value for name, value in arguments.items() if name in of_task})
-    settings, observers = _observers_of(settings, chosen)
+    settings, observers = _observers_of(settings, chosen, int(num_envs))
     if settings.max_cycles is None:
         cycles = max(1, math.ceil(chosen.duration / settings.control_period - 1e-9))
         settings = dataclasses.replace(settings, max_cycles=cycles)
-    return BatchedEnv(chosen.build(observers=observers, num_envs=int(num_envs)), task, settings, chosen.name)
+    with collection_paused():
+        return BatchedEnv(chosen.build(observers=observers, num_envs=int(num_envs)), task, settings, chosen.name)
 
 
 def make(
@@ -290,7 +292,7 @@ def _defaults(settings: type[Settings]) -> dict[str, Any]:
     return {field.name: field.default for field in dataclasses.fields(settings)}
 
 
-def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Observers]:
+def _observers_of(settings: Settings, scenario: Scenario, num_envs: int) -> tuple[Settings, Observers]:
     """The observers, and the settings with the scenario's network and estimator where none are chosen."""
     network = Network.of(scenario.network if settings.network is None else settings.network)
     if network is None:
@@ -305,7 +307,7 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
                 f"message_size={settings.message_size}: without a network there are no messages: choose one, e.g. "
                 "network='wifi'"
             )
-        return dataclasses.replace(settings, network=None), Proximal(settings.order, settings.threads)
+        return dataclasses.replace(settings, network=None), Proximal(settings.order, settings.threads_for(num_envs))
     if settings.order != 1:
         raise ValueError(
             f"order={settings.order} is of simulators without a network; under one steps are of order 1: leave it out, "
@@ -313,7 +315,7 @@ def _observers_of(settings: Settings, scenario: Scenario) -> tuple[Settings, Obs
         )
     estimator = settings.estimator or scenario.estimator
     chosen = dataclasses.replace(settings, network=network, estimator=estimator)
-    return chosen, Networked(network, estimator, settings.message_size)
+    return chosen, Networked(network, estimator, settings.message_size, settings.threads)
 
 
 def _chosen_scenario(scenario_or_name: Scenario | str | Path) -> Scenario:

@@ -15,6 +15,13 @@ Range: TypeAlias = tuple[int, int]
 T = TypeVar("T")
 
 
+def processors() -> int:
+    """Number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1  # where processes can't be bound to some
+
+
 class Threads:
     """A number of threads, started when they are first needed; the calling thread is one of them.
 
@@ -25,6 +32,9 @@ class Threads:
     def __init__(self, count: int) -> None:
         self.count = count
         self._pool: tuple[int, ThreadPoolExecutor] | None = None
+
+    def __repr__(self) -> str:
+        return f"Threads({self.count})"
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_pool": None}  # threads don't survive pickling

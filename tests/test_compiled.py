@@ -2,6 +2,7 @@
 
 import ast
 import errno
+import gc
 import importlib
 import pickle
 import re
@@ -14,6 +15,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from numba.core import event
 
 import khop_env.compiled as module
 from khop_env.compiled import compiled
@@ -241,3 +243,40 @@ def test_division_by_zero_is_ieee(function):
 
     assert divide(1.0, 0.0) == np.inf
     assert function(kernel)(1.0) == 2.0
+
+
+def test_python_collects_no_garbage_while_kernels_compile():
+    """And does again afterwards, where it did before, even if a kernel can't be compiled."""
+    seen = []
+
+    class Seen(event.Listener):
+        def on_start(self, _):
+            seen.append(gc.isenabled())
+
+        on_end = on_start
+
+    @compiled
+    def inner(x):
+        return x + 1.0
+
+    @compiled
+    def outer(x):
+        return inner(x)
+
+    @compiled
+    def wrong(x):
+        return inner(x).nothing
+
+    with event.install_listener("numba:compile", Seen()):
+        outer(1.0)
+    assert seen[:3] == [False, False, False]  # both begin, then the inner one ends
+    assert gc.isenabled()
+    with pytest.raises(numba.TypingError):
+        wrong(1)
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        outer(1)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

@@ -19,6 +19,7 @@ RANKS = [
         "khop_env.compiled",
         "khop_env.catalog",
         "khop_env.brief",
+        "khop_env.collection",
         "khop_env.extras",
         "khop_env.own_agents",
         "khop_env.objects",
@@ -162,6 +163,21 @@ def test_import_khop_env_is_light() -> None:
     loaded = loaded_by("import khop_env; khop_env.__version__")
     assert "khop_env" in loaded
     assert not NOT_ON_IMPORT & set(loaded)
+
+
+@pytest.mark.parametrize("arguments", [["list"], ["run", "--help"]])
+def test_khop_list_and_help_import_little(arguments: list[str]) -> None:
+    """They answer without scenarios, environments, graphs and compiled code."""
+    code = (
+        f"import sys; sys.argv[1:] = {arguments}\nfrom khop_env.cli import main\n"
+        "try: main()\nexcept SystemExit: print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.splitlines()[-1].split())
+    assert "khop_env.commands.scenarios" in loaded
+    assert not {"networkx", "numba"} & loaded
+    library = range(rank("khop_env.elementary"), rank("agents") + 1)
+    assert not [name for name in loaded if name in MODULES and name != "khop_env" and rank(name) in library]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from typing import Any
 
 import typer
 
+from khop_env.catalog import ENVIRONMENTS, describe
 from khop_env.commands.common import (
     EstimatorOption,
     JsonOption,
@@ -23,11 +24,9 @@ from khop_env.terminal import print_table, print_text, waiting
 
 def list_scenarios(as_json: JsonOption = False) -> None:
     """List the scenarios, a line each, and the environments, which run on all of them."""
-    from khop_env.registry import describe, environments
-
     found = describe()
     if as_json:
-        print_json({"scenarios": found, "environments": environments()})
+        print_json({"scenarios": found, "environments": list(ENVIRONMENTS)})
         return
     print_table(
         ("scenario", "parameters", "description"),
@@ -40,7 +39,7 @@ def list_scenarios(as_json: JsonOption = False) -> None:
             for each in found
         ],
     )
-    print_text(f"environments: {', '.join(environments())}")
+    print_text(f"environments: {', '.join(ENVIRONMENTS)}")
 
 
 def check(

@@ -171,7 +171,7 @@ def _collected(
     time, x, u, estimate, bound, age, newest = arrays
     layout, count = scenario.design.knowledge, len(time)
     largest = np.zeros(count)
-    largest_share(layout.column_source, estimate.T, x.T, bound.T, largest)
+    largest_share(layout.column_source, estimate.T, x.T, bound.T, largest, 0, len(x))
     wrong = violations(np.abs(estimate - x[:, layout.column_source]).T, bound.T, x.T, layout)
     h = float(time[1] - time[0]) if count > 1 else network.period
     most = max(2, MOST_ROWS // max(1, layout.size))

@@ -11,6 +11,8 @@ from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import Fleet
 
+_TILE = 32  # environments whose actions are read together
+
 
 class ActionReader:
     """Reads the actions of all acting agents, side by side.
@@ -24,6 +26,7 @@ class ActionReader:
 
     Attributes:
         offset: (N + 1,) where each agent's entries begin in the flat action.
+        shapes: that actions may have, the usual one first.
 
     Raises:
         ValueError: for an acting agent whose inputs have no limit.
@@ -32,7 +35,7 @@ class ActionReader:
     def __init__(
         self, fleet: Fleet, members: Sequence[int], uniform: bool, num_envs: int, message_size: int = 0
     ) -> None:
-        self._agents, self._num_envs, self._uniform = [fleet.ids[i] for i in members], num_envs, uniform
+        self._agents, self._num_envs = [fleet.ids[i] for i in members], num_envs
         models = [fleet.models[i] for i in members]
         unlimited = [
             name for name, model in zip(self._agents, models, strict=True) if not np.isfinite(model.input_limit).all()
@@ -57,13 +60,9 @@ class ActionReader:
         )
         self._column = np.array([first[number] + c for number, c in parts], np.int64)
         self._said = np.array([members[number] * message_size + c for number, c in words], np.int64)
-
-    @property
-    def shapes(self) -> list[tuple[int, ...]]:
-        """Shapes that actions may have, the usual one first."""
         width = int(self.offset[-1])
-        flat: list[tuple[int, ...]] = [(self._num_envs, width)]
-        return [(self._num_envs, len(self._agents), width // len(self._agents)), *flat] if self._uniform else flat
+        flat: list[tuple[int, ...]] = [(num_envs, width)]
+        self.shapes = [(num_envs, len(members), width // len(members)), *flat] if uniform else flat
 
     def read(self, actions: ArrayLike, command: FloatArray, said: FloatArray) -> IntArray:
         """Write actions into `command` (m, B) as fractions of the limits, clipped to [-1, 1], and data into `said`.
@@ -126,20 +125,17 @@ def read_actions(
     """
     for env in range(actions.shape[0]):
         for q in range(entry.size):
-            value = actions[env, entry[q]]
-            if not np.isfinite(value):
+            if not np.isfinite(actions[env, entry[q]]):
                 return env * entry.size + q
-    for env in range(actions.shape[0]):
+    for first in range(0, actions.shape[0], _TILE):
+        last = min(first + _TILE, actions.shape[0])
         for q in range(entry.size):
-            value = actions[env, entry[q]]
-            if value > 1.0:
-                value = 1.0
-                clipped[env, owner[q]] += 1
-            elif value < -1.0:
-                value = -1.0
-                clipped[env, owner[q]] += 1
-            if q < column.size:
-                command[column[q], env] = value
-            else:
-                said[row[q - column.size], env] = value
+            for env in range(first, last):
+                value = actions[env, entry[q]]
+                inside = min(max(value, -1.0), 1.0)
+                clipped[env, owner[q]] += inside != value
+                if q < column.size:
+                    command[column[q], env] = inside
+                else:
+                    said[row[q - column.size], env] = inside
     return -1

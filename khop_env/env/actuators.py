@@ -16,6 +16,8 @@ import numpy as np
 from khop_env.observers import FloatArray
 from khop_env.physics import did_you_mean
 
+OTHER, DIRECT, LAG, SLEW, HOLD = range(5)  # of `period.actuate`
+
 
 class Actuator(Protocol):
     """Turns commands into inputs, step by step."""
@@ -107,6 +109,20 @@ def as_actuator(actuator: str | Actuator) -> Actuator:
             f"no actuator {actuator!r}; {did_you_mean(actuator, ACTUATORS)} (or an object, e.g. Lag(time_constant=0.2))"
         )
     return ACTUATORS[actuator]()
+
+
+def compiled_form(actuator: Actuator, dt: float, step: int, steps: int) -> tuple[int, float]:
+    """Kind and parameter of the library's own actuators for `period.actuate`; OTHER and 0 for all others."""
+    kind = type(actuator)
+    if kind is Direct:
+        return DIRECT, 0.0
+    if kind is Lag:
+        return LAG, math.expm1(-dt / actuator.time_constant)  # type: ignore[attr-defined]
+    if kind is SlewLimit:
+        return SLEW, float(actuator.rate * dt)  # type: ignore[attr-defined]
+    if kind is Hold:
+        return HOLD, float(steps - step)
+    return OTHER, 0.0
 
 
 def described(part: object) -> str:

@@ -6,15 +6,18 @@ import copy
 import functools
 import reprlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from khop_env.brief import spread
 from khop_env.env.actions import ActionReader
+from khop_env.env.actuators import OTHER, compiled_form
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.layout import Float32Array, ObservationLayout
-from khop_env.env.options import seeds
+from khop_env.env.options import completed, seeds
+from khop_env.env.period import actuate, as_fractions, end_period, larger_for_all
 from khop_env.env.readout import Sources, summarize
 from khop_env.env.settings import Settings
 from khop_env.env.state import EnvState, Infos, Step, signature
@@ -23,6 +26,7 @@ from khop_env.simulation import Simulator
 from khop_env.simulation.received import ReceivedStates, links_up
 from khop_env.tasks import Outcome, Task, World
 from khop_env.tasks.checks import require_columns, require_outcome
+from khop_env.threads import Threads
 
 
 class BatchedEnv:
@@ -67,6 +71,7 @@ class BatchedEnv:
             x=state.x,
             inputs=inputs,
             initial=simulator.initial,
+            threads=Threads(settings.threads_for(self.num_envs)),
         )
         self.task = copy.deepcopy(task)
         self.task.memory = {}  # for those that override `bind` and have none
@@ -113,9 +118,11 @@ class BatchedEnv:
             np.zeros((known, self.num_envs)),
             data,
         )
-        self._parts = simulator.parts_of(settings.control_period / settings.substeps)
+        self._substeps, self._dt = settings.substeps, settings.control_period / settings.substeps
+        self._parts = simulator.parts_of(self._dt)
         self._command, self._physical = np.zeros_like(inputs), np.zeros_like(inputs)
         self._cycles, self._over = np.zeros(self.num_envs, np.int64), np.ones(self.num_envs, bool)
+        self._some_over = True
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeded = np.zeros(self.num_envs, bool)
         self._clipped_actions = np.zeros((self.num_envs, len(members)), np.int64)
@@ -158,7 +165,7 @@ class BatchedEnv:
         chosen_seeds = seeds(seed, chosen)
         generators = [self._generator(int(b), own) for b, own in zip(chosen, chosen_seeds, strict=True)]
         if initial_states is not None:
-            initial_states = self._completed(np.asarray(initial_states, dtype=float), generators)
+            initial_states = completed(initial_states, self.simulator.initial, generators)
         self.simulator.reset(generators, initial_states, chosen)
         for b, own, generator in zip(chosen.tolist(), chosen_seeds, generators, strict=True):
             self._generators[b] = generator
@@ -166,6 +173,7 @@ class BatchedEnv:
         self.world.inputs[:, chosen] = 0.0
         self._cycles[chosen] = 0
         self._over[chosen] = False
+        self._some_over = bool(self._over.any())
         self._clipped_actions[chosen] = 0
         self.task.reset(self.world, chosen, generators)
         return self._observed(self._evaluate())
@@ -189,12 +197,10 @@ class BatchedEnv:
         self._require_running(ended)
         self._clipped_actions = self._actions.read(actions, self._command, self._said)
         self.simulator.restart_extremes()
-        for number in range(self.settings.substeps):
+        for number in range(self._substeps):
             self._advance(number)
-        self._cycles += 1
-        outcome = self._evaluate()
-        truncated = (self._cycles >= self.settings.horizon) & ~outcome.terminated
-        self._over = outcome.terminated | truncated
+        outcome, truncated = self._evaluate(), np.empty(self.num_envs, bool)
+        self._some_over = end_period(self._cycles, self.settings.horizon, outcome.terminated, truncated, self._over)
         observations, infos = self._observed(outcome)
         return observations, outcome.reward, outcome.terminated, truncated, infos
 
@@ -208,6 +214,11 @@ class BatchedEnv:
         return self._over.copy()
 
     @property
+    def running(self) -> bool:
+        """Whether an episode is running in all environments."""
+        return not self._some_over
+
+    @property
     def begun(self) -> NDArray[np.bool_]:
         """(B,) True where the environment has been reset at least once."""
         return np.array([generator is not None for generator in self._generators])
@@ -218,7 +229,9 @@ class BatchedEnv:
 
     def state(self) -> Float32Array:
         """(B, S) the true global state, `state_fields` by name, in new memory."""
-        return self._read_state(self._sources, np.zeros((self.num_envs, 1), np.int64))
+        out = self._read_state.empty(self.num_envs)
+        self._read_state.write(self._sources, out, np.zeros((self.num_envs, 1), np.int64), 0, self.num_envs)
+        return out
 
     def get_state(self) -> EnvState:
         """A copy of everything that the next steps depend on, generators included."""
@@ -249,6 +262,7 @@ class BatchedEnv:
         self.simulator.restore(state.simulator)
         self.world.inputs[...] = state.inputs
         self._cycles, self._over, self._seeded = state.cycles.copy(), state.over.copy(), state.seeded.copy()
+        self._some_over = bool(self._over.any())
         self._generators = copy.deepcopy(state.generators)
         for name, values in state.task.items():
             self.task.memory[name][...] = values
@@ -260,23 +274,13 @@ class BatchedEnv:
         return signature(self.task, self.world, self.settings, self.simulator.disturbance, self.simulator.observers)
 
     def _generator(self, b: int, seed: int | None) -> np.random.Generator:
-        own = self._generators[b]
-        if (
-            seed is not None or own is None or not self._seeded[b]
-        ):  # an unseeded one must not repeat draws of the environment it was copied from
+        own = self._generators[b]  # must not repeat the draws of the environment it was copied from, unless seeded
+        if seed is not None or own is None or not self._seeded[b]:
             return np.random.default_rng(seed)
         return own
 
-    def _completed(self, x0: FloatArray, generators: Sequence[np.random.Generator]) -> FloatArray:
-        """Initial states in which nan is replaced by the simulator's draws."""
-        if not np.isnan(x0).any() or x0.shape[-1:] != (self.fleet.n,):
-            return x0
-        drawn = np.array([self.simulator.initial.draw(copy.deepcopy(rng)) for rng in generators])
-        return np.where(np.isnan(x0), drawn, x0)
-
     def _require_running(self, ended: NDArray[np.bool_] | None) -> None:
-        over = np.flatnonzero(self._over if ended is None else self._over & ~ended)
-        if over.size:
+        if self._some_over and (over := np.flatnonzero(self._over if ended is None else self._over & ~ended)).size:
             raise ValueError(
                 f"no episode is running in {len(over)} of {self.num_envs} environments, the first {over[0]}: call "
                 "reset() first"
@@ -284,15 +288,17 @@ class BatchedEnv:
 
     def _advance(self, number: int) -> None:
         """One simulator step of the control period."""
-        settings, inputs = self.settings, self.world.inputs
-        dt = settings.control_period / settings.substeps
-        inputs[...] = settings.actuator(self._command.T, inputs.T, dt, number, settings.substeps).T  # type: ignore[operator]
-        np.multiply(inputs, self._scale, out=self._physical)
+        actuator: Any = self.settings.actuator
+        inputs, physical = self.world.inputs, self._physical
+        kind, parameter = compiled_form(actuator, self._dt, number, self._substeps)
+        if kind == OTHER:
+            inputs[...] = actuator(self._command.T, inputs.T, self._dt, number, self._substeps).T
+        actuate(kind, parameter, self._command, self._scale, inputs, physical)
         if self._driven.size:
-            self.task.drive(self.world, self._physical)
-            inputs[self._driven] = self._physical[self._driven] / self._limit[self._driven]
-        self.simulator.hold(self._physical)
-        self.simulator.step_unchecked(dt, self._parts)
+            self.task.drive(self.world, physical)
+            as_fractions(self._driven, physical, self._limit, inputs)
+        self.simulator.hold(physical)
+        self.simulator.step_unchecked(self._dt, self._parts)
         self.task.moved(self.world, number)
 
     def _evaluate(self) -> Outcome:
@@ -303,12 +309,12 @@ class BatchedEnv:
     def _observe(self) -> tuple[Float32Array, IntArray]:
         """Observations, and the number of clipped entries of each agent's."""
         sources, clipped = self._sources, np.zeros((self.num_envs, len(self.agents)), np.int64)
+        readout, flat = self._read_observations, self._read_observations.empty(self.num_envs)
         observers, state = self.simulator.observers, self.simulator.state
+        information = observers.information(state) if observers.by_messages else None
         if sources.bound.size:
             observers.bound(state, sources.bound)
-        if observers.by_messages:
-            summarize(*observers.information(state), state.t, self.settings.control_period, sources.known)
-        elif self._received is not None:
+        if self._received is not None:
             up = links_up(self.simulator.design, observers, state)
             sources.known[...] = up
             if self.settings.observe == "estimate":
@@ -317,7 +323,13 @@ class BatchedEnv:
                     self._received.bounds(sources.bound, up)
         if sources.task.size:
             self.task.observe(self.world, sources.task)
-        flat = self._read_observations(sources, clipped)
+
+        def write(low: int, high: int) -> None:
+            if information is not None:
+                summarize(*information, state.t, sources.known, self.settings.control_period, low, high)
+            readout.write(sources, flat, clipped, low, high)
+
+        self.world.each(write, readout.size)
         if self.settings.uniform:
             return flat.reshape(self.num_envs, len(self.agents), -1), clipped
         return flat, clipped
@@ -325,15 +337,12 @@ class BatchedEnv:
     def _observed(self, outcome: Outcome) -> tuple[Float32Array, Infos]:
         observations, clipped = self._observe()
         extremes = self.simulator.running_extremes
+        normalized, relative = (np.empty((self.num_envs, len(self.agents))) for _ in range(2))
+        larger_for_all(tuple(extremes), normalized, relative)
         return observations, {
             **outcome.infos,
-            "max_normalized_disagreement": self._for_all(extremes.normalized, extremes.input_normalized),
-            "max_error_to_bound": self._for_all(extremes.relative, extremes.input_relative),
+            "max_normalized_disagreement": normalized,
+            "max_error_to_bound": relative,
             "clipped_observations": clipped,
             "clipped_actions": self._clipped_actions.copy(),
         }
-
-    def _for_all(self, of_states: FloatArray, of_inputs: FloatArray) -> FloatArray:
-        """(B, N) the larger of two ratios (B,), the same for all agents of an environment."""
-        out = np.empty((self.num_envs, len(self.agents)))
-        return np.maximum(of_states[:, None], of_inputs[:, None], out=out)

@@ -6,6 +6,7 @@ by relevance to its task: task edges first, then hop distance, then index.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from khop_env.observers import IntArray, ObserverDesign
-from khop_env.physics import AgentModel, did_you_mean, hops_from_targets
+from khop_env.physics import AgentModel, did_you_mean, hops_from_targets, read_only
 
 Float32Array = NDArray[np.float32]
 
@@ -36,7 +37,7 @@ class Field(NamedTuple):
     high: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Slot:
     """Constant properties of another agent within k hops.
 
@@ -56,6 +57,26 @@ class Slot:
     task_edge: bool
 
 
+class _Columns:
+    """Columns that agents with equal observations share in memory."""
+
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self.fields = tuple(fields)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(field.name for field in self.fields)
+
+    @cached_property
+    def bounds(self) -> tuple[Float32Array, Float32Array]:
+        low, high = (np.array([getattr(field, end) for field in self.fields], np.float32) for end in ("low", "high"))
+        return read_only(low), read_only(high)
+
+    @cached_property
+    def place(self) -> dict[str, int]:
+        return {name: column for column, name in enumerate(self.names)}
+
+
 class ObservationLayout:
     """Names, units and bounds of every column of one agent's observation.
 
@@ -72,7 +93,14 @@ class ObservationLayout:
     """
 
     def __init__(self, agent: str, fields: Sequence[Field], slots: Sequence[Slot]) -> None:
-        self.agent, self.fields, self.slots = agent, tuple(fields), tuple(slots)
+        self.agent, self.slots = agent, tuple(slots)
+        self._columns = _Columns(fields)
+
+    def shared_by(self, agent: str, slots: Sequence[Slot]) -> ObservationLayout:
+        """The layout of another `agent` with other `slots` and the same columns, which are in memory once."""
+        other = copy.copy(self)
+        other.agent, other.slots = agent, tuple(slots)
+        return other
 
     def __repr__(self) -> str:
         return f"ObservationLayout({self.agent!r}, {len(self)} columns, {len(self.slots)} slots)"
@@ -81,24 +109,25 @@ class ObservationLayout:
         """Number of columns."""
         return len(self.fields)
 
-    @cached_property
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """One per column."""
+        return self._columns.fields
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The fields' names, in order."""
-        return tuple(field.name for field in self.fields)
+        return self._columns.names
 
-    @cached_property
+    @property
     def low(self) -> Float32Array:
-        """(D,) smallest values."""
-        return np.array([field.low for field in self.fields], np.float32)
+        """(D,) smallest values, read-only."""
+        return self._columns.bounds[0]
 
-    @cached_property
+    @property
     def high(self) -> Float32Array:
-        """(D,) largest values."""
-        return np.array([field.high for field in self.fields], np.float32)
-
-    @cached_property
-    def _place(self) -> dict[str, int]:
-        return {name: column for column, name in enumerate(self.names)}
+        """(D,) largest values, read-only."""
+        return self._columns.bounds[1]
 
     def index(self, name: str) -> int:
         """The column of a field.
@@ -106,9 +135,10 @@ class ObservationLayout:
         Raises:
             KeyError: if there is no such field; the message suggests the closest name.
         """
-        if name not in self._place:
+        place = self._columns.place
+        if name not in place:
             raise self._unknown(name, self.names)
-        return self._place[name]
+        return place[name]
 
     def columns(self, prefix: str) -> NDArray[np.int64]:
         """The columns of a field, or of all fields below it: "slot0.position" has one per axis.

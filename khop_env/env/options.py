@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import reprlib
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import Fleet, did_you_mean
+from khop_env.simulation import InitialSet
 
 RESET_OPTIONS = ("initial_state",)
 
@@ -34,6 +37,15 @@ def seeds(seed: int | Sequence[int | None] | None, env_ids: IntArray) -> list[in
     if len(values) != len(env_ids):
         raise ValueError(f"expected one seed or {len(env_ids)}, one per environment that is reset; got {len(values)}")
     return values
+
+
+def completed(states: ArrayLike, initial: InitialSet, generators: Sequence[np.random.Generator]) -> FloatArray:
+    """Initial states in which nan is replaced by what the generators, which stay as they are, would draw."""
+    x0 = np.asarray(states, dtype=float)
+    if not np.isnan(x0).any() or x0.shape[-1:] != initial.center.shape:
+        return x0
+    drawn = np.array([initial.draw(copy.deepcopy(rng)) for rng in generators])
+    return np.where(np.isnan(x0), drawn, x0)
 
 
 def reset_options(options: Mapping[str, Any] | None) -> Mapping[str, Any]:

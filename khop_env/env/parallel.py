@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import reprlib
 import warnings
 from collections.abc import Mapping
@@ -77,6 +78,7 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         }
         self.state_space = state_space(batched)
         self._actions = np.zeros((1, int(batched.action_offset[-1])))
+        self._shapes = [space.shape for space in self.action_spaces.values()]
         self._begun = False
         self._renderer: Renderer | None = None
         if render_mode is not None:
@@ -136,9 +138,9 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         agents = self.possible_agents
         return (
             self._by_agent(observations),
-            dict(zip(agents, reward[0].tolist(), strict=True)),
-            dict.fromkeys(agents, bool(terminated[0])),
-            dict.fromkeys(agents, bool(truncated[0])),
+            dict(zip(agents, reward.tolist()[0])),  # noqa: B905 -- strict costs time, at every step
+            dict.fromkeys(agents, terminated.item()),
+            dict.fromkeys(agents, truncated.item()),
             self._infos(infos),
         )
 
@@ -195,13 +197,15 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
         return agent
 
     def _flat(self, actions: Mapping[str, Float32Array]) -> FloatArray:
-        if not isinstance(actions, Mapping):
+        if type(actions) is not dict and not isinstance(actions, Mapping):
             raise TypeError(
                 f"step() takes a mapping with an action for each agent, {{{self.possible_agents[0]!r}: ..., ...}}; got "
                 f"{reprlib.repr(actions)} ({type(actions).__name__}); arrays of all agents go to batched.step()"
             )
         if not self.agents:
             raise ValueError("no episode is running: it is over, or none has begun; call reset() first")
+        if type(actions) is dict and len(actions) == len(self._shapes) and self._joined(actions):
+            return self._actions
         if actions.keys() != self._entries.keys():
             for agent in actions:  # a wrong name explains the missing ones
                 self._known(agent)
@@ -223,8 +227,21 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             flat[part] = action
         return self._actions
 
+    def _joined(self, actions: Mapping[str, Float32Array]) -> bool:
+        """Write arrays of the agents' shapes into the flat action; False if they are anything else."""
+        try:
+            values = [actions[agent] for agent in self.possible_agents]
+            if [value.shape for value in values] != self._shapes:
+                return False
+            np.concatenate(values, out=self._actions[0])
+        except Exception:  # whatever it is, a look at one action after the other finds it
+            return False
+        return True
+
     def _by_agent(self, observations: Float32Array) -> dict[str, Float32Array]:
-        flat = observations.reshape(-1)
+        if observations.ndim == 3:
+            return dict(zip(self.possible_agents, observations[0]))  # noqa: B905
+        flat = observations[0]
         return {agent: flat[part] for agent, part in self._columns.items()}
 
     def follow(self, *, begins: bool = False) -> None:
@@ -234,17 +251,19 @@ class KHopEnv(ParallelEnv[str, Float32Array, Float32Array]):
             begins: whether an episode has just begun.
         """
         self._begun = True
-        self.agents = [] if self.batched.over[0] else list(self.possible_agents)
+        self.agents = self.possible_agents.copy() if self.batched.running else []
+        if self._renderer is None:
+            return
         self._remember(begins=begins)
-        if self._renderer is not None and self.render_mode == "human":
+        if self.render_mode == "human":
             try:
                 self._draw(self._renderer)
             except Exception as error:  # for any fault of a display: the step has been made, so return its results
                 warnings.warn(f"the window isn't drawn: {error}", RuntimeWarning, stacklevel=3)
 
     def _infos(self, infos: Infos) -> dict[str, dict[str, float]]:
-        rows = zip(*(values[0].tolist() for values in infos.values()), strict=True)
-        return {agent: dict(zip(infos, row, strict=True)) for agent, row in zip(self._columns, rows, strict=True)}
+        rows = zip(*[values.tolist()[0] for values in infos.values()])  # noqa: B905
+        return dict(zip(self.possible_agents, map(dict, map(zip, itertools.repeat(tuple(infos)), rows))))  # noqa: B905
 
     def _remember(self, *, begins: bool) -> None:
         """Add to the trails, or begin new ones, so that frames show the whole path however seldom they are drawn."""

@@ -70,19 +70,6 @@ class Sources(NamedTuple):
     data: FloatArray
 
 
-class _LiveColumns(NamedTuple):
-    """Arrays over the columns that aren't constant, with the attributes of `Column`."""
-
-    column: IntArray
-    kind: IntArray
-    row: IntArray
-    origin: IntArray
-    gate: IntArray
-    owner: IntArray
-    low: FloatArray
-    high: FloatArray
-
-
 class Readout:
     """Fills (B, columns) vectors; every value lies within its field's bounds.
 
@@ -93,6 +80,7 @@ class Readout:
     Attributes:
         template: (columns,) the constants.
         uses_bounds: whether any column reads guaranteed bounds.
+        size: number of columns that aren't constant.
         task_rows: rows of the task's live columns.
     """
 
@@ -102,43 +90,70 @@ class Readout:
         kinds, rows = [columns[q].kind for q in live], [columns[q].row for q in live]
         # float32 bounds, so that values clipped to them in float64 are inside them as float32, too
         bounds = np.array([columns[q].bounds for q in live], np.float32).reshape(-1, 2).astype(float)
-        live_columns = _LiveColumns(
-            np.array(live, np.int64),
-            np.array(kinds, np.int64),
-            np.array(rows, np.int64),
-            np.array([columns[q].origin for q in live], np.int64),
-            np.array([columns[q].gate for q in live], np.int64),
-            np.array([owner[q] for q in live], np.int64),
-            np.ascontiguousarray(bounds[:, 0]),
-            np.ascontiguousarray(bounds[:, 1]),
-        )
-        self._live: Any = tuple(live_columns)  # Numba recognises the types of a plain tuple more quickly
-        self.uses_bounds = BOUND in kinds
+        owners = [owner[q] for q in live]
+        origins, gates = ([getattr(columns[q], name) for q in live] for name in ("origin", "gate"))
+        self._live = np.array([live, kinds, rows, origins, gates, owners], np.int64)
+        self._bounds = np.ascontiguousarray(bounds.T)
+        self.uses_bounds, self.size = BOUND in kinds, len(live)
         self.task_rows = 1 + max((row for kind, row in zip(kinds, rows, strict=True) if kind == TASK), default=-1)
 
-    def __call__(self, sources: Sources, clipped: IntArray) -> Float32Array:
-        """Vectors (B, columns) in new memory; adds the number of clipped values to `clipped` (B, owners)."""
-        out = np.empty((sources.x.shape[1], len(self.template)), np.float32)
-        fill(self._live, self.template, tuple(sources), out, clipped)
-        return out
+    def empty(self, num_envs: int) -> Float32Array:
+        """(B, columns) new memory for `write`."""
+        return np.empty((num_envs, len(self.template)), np.float32)
+
+    def write(self, sources: Sources, out: Float32Array, clipped: IntArray, low: int, high: int) -> None:
+        """Write the vectors of environments `low` to `high` into `out` (B, columns).
+
+        Args:
+            sources: of all environments.
+            out: overwritten.
+            clipped: (B, owners), to which the number of clipped values is added.
+            low: first environment.
+            high: one past the last.
+        """
+        fill(self._live, self._bounds, self.template, tuple(sources), out, clipped, low, high)
 
 
 @compiled
-def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, clipped: IntArray) -> None:
-    """Write `template` and the live columns into `out` (B, columns); count values out of bounds per owner.
+def fill(
+    live: IntArray,
+    bounds: FloatArray,
+    template: Float32Array,
+    sources: Any,
+    out: Float32Array,
+    clipped: IntArray,
+    low: int,
+    high: int,
+) -> None:
+    """Write `template` and the live columns, C of them, into `out`; count values out of bounds per owner.
 
-    `live` and `sources` are the fields of `_LiveColumns` and `Sources` as plain tuples.
+    Args:
+        live: (6, C) where each column stands in `out`, then its kind, row, origin, gate and owner, as in `Column`.
+        bounds: (2, C) its smallest and largest value.
+        template: (columns,) the constants.
+        sources: the fields of `Sources` as a plain tuple, which Numba recognises more quickly.
+        out: (B, columns) overwritten.
+        clipped: (B, owners) added to.
+        low: first environment.
+        high: one past the last.
     """
-    live, sources = _LiveColumns(*live), Sources(*sources)
+    sources = Sources(*sources)
     x, estimate = sources.x, sources.estimate
     values = np.empty(_TILE)
-    for first in range(0, out.shape[0], _TILE):
-        width = min(_TILE, out.shape[0] - first)
+    for first in range(low, high, _TILE):
+        width = min(_TILE, high - first)
         for e in range(width):
             out[first + e] = template
-        for q in range(live.column.size):
-            column, kind, row, origin, owner = live.column[q], live.kind[q], live.row[q], live.origin[q], live.owner[q]
-            low, high = live.low[q], live.high[q]
+        for q in range(live.shape[1]):
+            column, kind, row, origin, gate, owner = (
+                live[0, q],
+                live[1, q],
+                live[2, q],
+                live[3, q],
+                live[4, q],
+                live[5, q],
+            )
+            least, most = bounds[0, q], bounds[1, q]
             if kind == STATE_RELATIVE:
                 for e in range(width):
                     values[e] = x[row, first + e] - x[origin, first + e]
@@ -154,7 +169,7 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
             elif kind == BOUND:
                 for e in range(width):
                     bound = sources.bound[row, first + e]
-                    values[e] = bound if bound < np.inf else high  # no bound: the largest value, and nothing clipped
+                    values[e] = bound if bound < np.inf else most  # no bound: the largest value, and nothing clipped
             elif kind == INPUT:
                 for e in range(width):
                     values[e] = sources.inputs[row, first + e]
@@ -179,25 +194,31 @@ def fill(live: Any, template: Float32Array, sources: Any, out: Float32Array, cli
             else:
                 for e in range(width):
                     values[e] = np.sin(estimate[row, first + e])
-            gate = live.gate[q]
             if gate >= 0:
                 for e in range(width):
                     values[e] = values[e] * sources.known[gate, first + e] + 0.0  # no -0.0, whose sign would tell
             outside = 0
             for e in range(width):
-                outside += (values[e] < low) | (values[e] > high)
+                outside += (values[e] < least) | (values[e] > most)
             if outside:
                 for e in range(width):
-                    clipped[first + e, owner] += (values[e] < low) | (values[e] > high)
+                    clipped[first + e, owner] += (values[e] < least) | (values[e] > most)
             for e in range(width):
-                values[e] = min(max(values[e], low), high)
+                values[e] = min(max(values[e], least), most)
             for e in range(width):
                 out[first + e, column] = values[e]
 
 
 @compiled
 def summarize(
-    age: FloatArray, hops: FloatArray, since: FloatArray, t: FloatArray, period: float, out: FloatArray
+    age: FloatArray,
+    hops: FloatArray,
+    since: FloatArray,
+    t: FloatArray,
+    out: FloatArray,
+    period: float,
+    low: int,
+    high: int,
 ) -> None:
     """Write what agents know of the information that their estimates rest on, from `observers.Information`.
 
@@ -206,14 +227,16 @@ def summarize(
         hops: (pairs, B) links over which it came.
         since: (pairs, B) time since it arrived, in s.
         t: (B,) time since reset in s.
-        period: the control period in s.
         out: (4 pairs, B) overwritten: VALID, whether anything has arrived; HEARD, whether something newer has within
             the last control period; HOPS; AGE in s, and where nothing has arrived the time since reset.
+        period: the control period in s.
+        low: first environment.
+        high: one past the last.
     """
     pairs = age.shape[0]
     recent = period * (1.0 - 1e-6)  # what arrived with the observation before is a whole period old, but for rounding
     for q in range(pairs):
-        for e in range(t.size):
+        for e in range(low, high):
             valid = age[q, e] < np.inf
             out[VALID * pairs + q, e] = valid
             out[HEARD * pairs + q, e] = since[q, e] < recent

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 
@@ -14,7 +14,9 @@ from khop_env.observers import Estimator, as_estimator
 from khop_env.observers.proximal import MOST_THREADS
 from khop_env.physics import or_did_you_mean
 from khop_env.simulation import OBSERVE, Observe
+from khop_env.threads import processors
 
+FEWEST = 64  # environments for each thread of threads="auto"
 MOST_DATA = 1000  # numbers of a policy in a message
 NUMBER = (int, float, np.integer, np.floating)
 
@@ -37,7 +39,8 @@ class Settings:
         actuator: "direct", "lag", "slew", "hold", or an `Actuator`.
         limit: bound on positions and other states in observations, in their own units, and on ages in s; values beyond
             are clipped.
-        threads: of the observers' solve; not used under a network.
+        threads: that share the environments of a batch in a step, or "auto": as many as there are processors for this
+            process, with at least 64 environments for each. Results don't depend on them.
         network: how messages are exchanged: a profile's name, also with other values as in "lossy:period=0.1,loss=0.3",
             a `Network` or a mapping of its values; "none" for exchange in continuous time, without messages; None for
             the scenario's own, which by default is that, too.
@@ -59,7 +62,7 @@ class Settings:
     order: int = 1
     actuator: str | Actuator = "direct"
     limit: float = 100.0
-    threads: int = 1
+    threads: int | Literal["auto"] = 1
     network: str | Network | Mapping[str, object] | None = None
     estimator: str | Estimator | None = None
     message_size: int = 0
@@ -75,11 +78,12 @@ class Settings:
                 raise ValueError(f"{name} must be True or False; got {getattr(self, name)!r}")
         for name in ("max_cycles", "order", "threads"):
             value = getattr(self, name)
-            if value is None and name == "max_cycles":
+            if (value is None and name == "max_cycles") or (name == "threads" and value == "auto"):
                 continue
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ValueError(f"{name} must be a positive integer; got {value!r}")
-        if self.threads > MOST_THREADS:
+                other = " or 'auto'" if name == "threads" else ""
+                raise ValueError(f"{name} must be a positive integer{other}; got {value!r}")
+        if isinstance(self.threads, int | np.integer) and self.threads > MOST_THREADS:
             raise ValueError(f"threads must be at most {MOST_THREADS}; got {self.threads!r}")
         size = self.message_size
         if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 0 <= size <= MOST_DATA:
@@ -136,6 +140,12 @@ class Settings:
             )
         return steps
 
+    def threads_for(self, num_envs: int) -> int:
+        """Number of threads for a batch of so many environments: `threads`, or what "auto" means for it."""
+        if self.threads == "auto":
+            return max(1, min(processors(), num_envs // FEWEST, MOST_THREADS))
+        return int(self.threads)
+
     @property
     def inputs_are_states(self) -> bool:
         """True if the actuator remembers its input, which agents then observe."""
@@ -154,7 +164,7 @@ class SettingsArguments(TypedDict, total=False):
     order: int
     actuator: str | Actuator
     limit: float
-    threads: int
+    threads: int | Literal["auto"]
     network: str | Network | Mapping[str, object] | None
     estimator: str | Estimator | None
     message_size: int

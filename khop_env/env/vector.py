@@ -120,7 +120,7 @@ class KHopVectorEnv(VectorEnv[Float32Array, Float32Array, FloatArray]):
             raise ValueError(f"actions must have shape {self.action_space.shape}; got {values.shape}")
         values = values.reshape(batched.num_envs, agents, -1)
         ended = np.zeros(batched.num_envs, bool)
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and not batched.running:
             ended = batched.over & batched.begun
         if ended.any():
             values = values.copy()

@@ -18,6 +18,7 @@ from khop_env.network.network import Network
 from khop_env.network.randomness import draw_keys
 from khop_env.network.rounds import WORD, Rules, add_noise, run_round, send, start_links, take_heard
 from khop_env.physics import FloatArray, IndexArray, Links
+from khop_env.threads import Range
 
 ChannelMemory = dict[str, NDArray[Any]]
 """Arrays of a channel by name, batch last; see `Channel.allocate`."""
@@ -27,7 +28,8 @@ class Channel:
     """The links of a network in B environments.
 
     Memory belongs to the caller, so that it is copied, saved and restored with everything else; the same memory
-    continues with the same bits, in any batch.
+    continues with the same bits, in any batch. Methods that take a `part` work on that range of the environments, all
+    of them by default, and touch no others, so that threads may share a batch.
 
     Args:
         network: what happens to messages.
@@ -39,6 +41,7 @@ class Channel:
     def __init__(self, network: Network, links: Links, num_envs: int, width: int = 0) -> None:
         self.network, self.links, self.num_envs, self.width = network, links, num_envs, width
         self.rules = Rules.of(network)
+        self._all = 0, num_envs
         self._all_up, self._all_due = np.ones((len(links), num_envs), np.bool_), np.ones(num_envs, np.bool_)
 
     def allocate(self) -> ChannelMemory:
@@ -76,12 +79,18 @@ class Channel:
         """(B,) whether the next round of `memory` has come at the times `t` (B,), in s since reset."""
         return t >= (memory["round"] + (1.0 - 1e-9)) * self.network.period
 
-    def measured(self, memory: ChannelMemory, x: FloatArray) -> FloatArray:
-        """States `x` (n, B) as agents measure and send them in the next round of `memory`; `x` itself without noise."""
+    def measured(
+        self, memory: ChannelMemory, x: FloatArray, out: FloatArray | None = None, part: Range | None = None
+    ) -> FloatArray:
+        """States `x` (n, B) as agents measure and send them in the next round of `memory`.
+
+        Returns:
+            `out` (n, B), new memory if it is left out; without noise `x` itself.
+        """
         if self.network.noise == 0.0:
             return x
-        out = np.empty(x.shape)
-        add_noise(self.network.noise, memory["key"], memory["round"], x, out)
+        out = np.empty(x.shape) if out is None else out
+        add_noise(self.network.noise, memory["key"], memory["round"], x, out, *(part or self._all))
         return out
 
     def exchange(
@@ -110,7 +119,11 @@ class Channel:
         self.send(memory, [values], due)
 
     def begin_round(
-        self, memory: ChannelMemory, up: NDArray[np.bool_] | None = None, due: NDArray[np.bool_] | None = None
+        self,
+        memory: ChannelMemory,
+        up: NDArray[np.bool_] | None = None,
+        due: NDArray[np.bool_] | None = None,
+        part: Range | None = None,
     ) -> None:
         """Decide what is lost of the messages of a new round, and what arrives now; `send` has to follow.
 
@@ -118,29 +131,38 @@ class Channel:
             memory: of the channel; changed.
             up: (L, B) links that are up now; a message sent over one that is down is lost. None for all.
             due: (B,) environments in which there is a round now; in the others nothing happens. None for all.
+            part: see the class.
 
         Raises:
             ValueError: for an array of a wrong shape.
         """
         up = self._array(up, self._all_up, "up (links, environments)")
         due = self._array(due, self._all_due, "due (environments,)")
-        state = (memory[name] for name in ("bad", "lost", "newest", "heard"))
-        run_round(self.rules, memory["key"], memory["round"], due, up, *state)
+        key, number, bad, lost = memory["key"], memory["round"], memory["bad"], memory["lost"]
+        newest, heard = memory["newest"], memory["heard"]
+        run_round(self.rules, key, number, due, up, bad, lost, newest, heard, *(part or self._all))
 
-    def send(self, memory: ChannelMemory, parts: Sequence[FloatArray], due: NDArray[np.bool_] | None = None) -> None:
+    def send(
+        self,
+        memory: ChannelMemory,
+        parts: Sequence[FloatArray],
+        due: NDArray[np.bool_] | None = None,
+        part: Range | None = None,
+    ) -> None:
         """Send the messages of the round that has begun.
 
         Args:
             memory: of the channel; changed.
             parts: rows of what all agents send, (rows, B) each, W rows in all.
             due: as for `begin_round`.
+            part: see the class.
         """
-        due, first = self._array(due, self._all_due, "due (environments,)"), 0
-        for part in parts:
-            send(part, first, memory["round"], due, memory["sent"])
-            first += len(part)
+        due = self._array(due, self._all_due, "due (environments,)")
+        send(tuple(parts), 0, memory["round"], due, memory["sent"], *(part or self._all))
 
-    def receive(self, memory: ChannelMemory, link: IndexArray, row: IndexArray, held: FloatArray) -> None:
+    def receive(
+        self, memory: ChannelMemory, link: IndexArray, row: IndexArray, held: FloatArray, part: Range | None = None
+    ) -> None:
         """Copy what is new since the round before; what nothing new came for keeps its last value.
 
         Args:
@@ -148,15 +170,16 @@ class Channel:
             link: (C,) over which each number comes.
             row: (C,) its place in `values`.
             held: (C, B) changed where a newer message came.
+            part: see the class.
         """
-        take_heard(memory["sent"], memory["newest"], memory["heard"], link, row, held)
+        take_heard(memory["sent"], memory["newest"], memory["heard"], link, row, held, *(part or self._all))
 
     def age(self, memory: ChannelMemory) -> NDArray[np.int64]:
         """(L, B) rounds since the newest message that has arrived was sent, -1 where nothing has."""
         return np.where(memory["newest"] < 0, -1, memory["round"] - memory["newest"])
 
     def _array(self, given: NDArray[np.bool_] | None, default: NDArray[np.bool_], what: str) -> NDArray[np.bool_]:
-        if given is None:
+        if given is None or given is default:
             return default
         if np.shape(given) != default.shape:
             raise ValueError(f"{what} has shape {np.shape(given)}; expected {default.shape}")

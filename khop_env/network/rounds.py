@@ -1,4 +1,7 @@
-"""Compiled rounds: what becomes of the messages of all links of all environments."""
+"""Compiled rounds: what becomes of the messages of all links, in a range of environments.
+
+`low` is the first environment and `high` one past the last, so that threads share a batch.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.compiled import compiled, inlined
+from khop_env.compiled import compiled, inlined, place
 from khop_env.network.network import Network
 from khop_env.network.randomness import DELAY, EPISODE, EPISODE_ROUND, LOSS, NOISE, round_key, uniform
 from khop_env.physics import FloatArray, IndexArray
 
 WORD = 64
+FEW_SLOTS = 4  # of the ring: up to so many one loop each, which vectorises, costs less than looking each place up
 
 
 class Rules(NamedTuple):
@@ -65,63 +69,100 @@ def run_round(
     lost: NDArray[np.uint64],
     newest: NDArray[np.int64],
     heard: NDArray[np.bool_],
+    low: int,
+    high: int,
 ) -> None:
     """One round in the environments that are due: who loses what, and what arrives."""
-    links, batch = newest.shape
+    links, width = newest.shape[0], high - low
     bits = WORD * lost.shape[0]
-    of_round = np.empty(batch, np.uint64)
-    after_delivery, after_loss, latency = np.empty(batch), np.empty(batch), np.empty(batch)
-    for b in range(batch):
+    of_round = np.empty(width, np.uint64)
+    after_delivery, after_loss, latency = np.empty(width), np.empty(width), np.empty(width)
+    for e in range(width):
+        b = place(low + e)
         if due[b]:
             number[b] += 1
         base = round_key(key[b], EPISODE_ROUND)
         loss = rules.loss_low + rules.loss_span * uniform(base, 0, EPISODE)
-        latency[b] = rules.latency_low + rules.latency_span * uniform(base, 1, EPISODE)
-        after_delivery[b] = after_loss[b] = loss
+        latency[e] = rules.latency_low + rules.latency_span * uniform(base, 1, EPISODE)
+        after_delivery[e] = after_loss[e] = loss
         if rules.recovery > 0.0:
-            after_delivery[b], after_loss[b] = rules.recovery * loss / (1.0 - loss), 1.0 - rules.recovery
-        of_round[b] = round_key(key[b], number[b])
+            after_delivery[e], after_loss[e] = rules.recovery * loss / (1.0 - loss), 1.0 - rules.recovery
+        of_round[e] = round_key(key[b], number[b])
     for link in range(links):
-        for b in range(batch):
+        for e in range(width):
+            b = place(low + e)
             heard[link, b] = False
             if not due[b]:
                 continue
             now = number[b]
-            threshold = after_loss[b] if bad[link, b] else after_delivery[b]
-            bad[link, b] = uniform(of_round[b], link, LOSS) < threshold
+            threshold = after_loss[e] if bad[link, b] else after_delivery[e]
+            bad[link, b] = uniform(of_round[e], link, LOSS) < threshold
             word, bit = now % bits // WORD, np.uint64(1) << np.uint64(now % WORD)
             if bad[link, b] or not up[link, b]:
                 lost[word, link, b] |= bit
             else:
                 lost[word, link, b] &= ~bit
-            soonest = _rounds_late(rules, latency[b], 0.0)
-            latest = _rounds_late(rules, latency[b], 1.0)
+            soonest = _rounds_late(rules, latency[e], 0.0)
+            latest = _rounds_late(rules, latency[e], 1.0)
             for age in range(soonest, min(latest, now - newest[link, b] - 1) + 1):
                 sent = now - age
                 if (lost[sent % bits // WORD, link, b] >> np.uint64(sent % WORD)) & np.uint64(1):
                     continue
                 if latest > soonest:
                     u = uniform(round_key(key[b], sent), link, DELAY)
-                    if _rounds_late(rules, latency[b], u) > age:
+                    if _rounds_late(rules, latency[e], u) > age:
                         continue
                 newest[link, b], heard[link, b] = sent, True
                 break
 
 
 @compiled
-def send(values: FloatArray, first: int, number: NDArray[np.int64], due: NDArray[np.bool_], sent: FloatArray) -> None:
-    """Keep what agents send in this round's place of the ring (rounds, W, B), as its rows from `first` on."""
-    place = number % sent.shape[0]
-    for row in range(values.shape[0]):
-        for b in range(values.shape[1]):
-            if due[b]:
-                sent[place[b], first + row, b] = values[row, b]
+def send(
+    parts: tuple[FloatArray, ...],
+    first: int,
+    number: NDArray[np.int64],
+    due: NDArray[np.bool_],
+    sent: FloatArray,
+    low: int,
+    high: int,
+) -> None:
+    """Keep what agents send, parts (rows, B) one below the other, in this round's place of the ring (rounds, W, B).
+
+    Its rows there begin at `first`.
+    """
+    capacity, width = sent.shape[0], high - low
+    slots = np.empty(width, np.int64)  # of the ring; -1 where nothing is sent
+    in_use = np.zeros(capacity, np.bool_)
+    for e in range(width):
+        b = place(low + e)
+        slots[e] = number[b] % capacity if due[b] else -1
+        if slots[e] >= 0:
+            in_use[slots[e]] = True
+    for slot in range(capacity):
+        if not in_use[slot]:
+            continue
+        row = first
+        for k in range(len(parts)):
+            values = parts[k]
+            for r in range(values.shape[0]):
+                for e in range(width):
+                    b = place(low + e)
+                    sent[slot, row, b] = values[r, b] if slots[e] == slot else sent[slot, row, b]
+                row += 1
 
 
 @compiled
-def add_noise(noise: float, key: NDArray[np.uint64], number: NDArray[np.int64], x: FloatArray, out: FloatArray) -> None:
+def add_noise(
+    noise: float,
+    key: NDArray[np.uint64],
+    number: NDArray[np.int64],
+    x: FloatArray,
+    out: FloatArray,
+    low: int,
+    high: int,
+) -> None:
     """Write what agents measure for the next round into `out`."""
-    for b in range(x.shape[1]):
+    for b in range(low, high):
         base = round_key(key[b], number[b] + 1)
         for row in range(x.shape[0]):
             out[row, b] = x[row, b] + noise * (2.0 * uniform(base, row, NOISE) - 1.0)
@@ -135,14 +176,28 @@ def take_heard(
     link: IndexArray,
     row: IndexArray,
     out: FloatArray,
+    low: int,
+    high: int,
 ) -> None:
     """Copy into `out` (C, B) what came over links in this round, and leave the rest."""
-    place = np.empty(newest.shape, np.int64)  # in the ring, -1 where nothing is new
+    capacity, width = sent.shape[0], high - low
+    slots = np.empty((newest.shape[0], width), np.int64)  # of the ring, -1 where nothing is new
+    in_use = np.zeros((newest.shape[0], capacity), np.bool_)
     for over in range(newest.shape[0]):
-        for b in range(newest.shape[1]):
-            place[over, b] = newest[over, b] % sent.shape[0] if heard[over, b] else -1
+        for e in range(width):
+            b = place(low + e)
+            slots[over, e] = newest[over, b] % capacity if heard[over, b] else -1
+            if slots[over, e] >= 0:
+                in_use[over, slots[over, e]] = True
     for c in range(len(link)):
-        for b in range(out.shape[1]):
-            at = place[link[c], b]
-            if at >= 0:
-                out[c, b] = sent[at, row[c], b]
+        over = link[c]
+        if in_use[over].sum() > FEW_SLOTS:
+            for e in range(width):
+                if slots[over, e] >= 0:
+                    out[c, place(low + e)] = sent[slots[over, e], row[c], place(low + e)]
+            continue
+        for slot in range(capacity):
+            if in_use[over, slot]:
+                for e in range(width):
+                    b = place(low + e)
+                    out[c, b] = sent[slot, row[c], b] if slots[over, e] == slot else out[c, b]

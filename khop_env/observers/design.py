@@ -254,7 +254,8 @@ class ObserverDesign:
             relay=self.relay,
             changing=self.schedule is not None,
         )
-        states, inputs = lay_out(), lay_out(targets=observed_inputs)
+        states = lay_out()
+        inputs = states if len(observed_inputs) == len(fleet) else lay_out(targets=observed_inputs)
         values = {
             "design_rule": rule,
             "links": links,
@@ -307,11 +308,15 @@ class ObserverDesign:
     ) -> tuple[PerformanceFunction, ...]:
         """One performance function per row of the layout."""
         rows: list[PerformanceFunction] = []
+        known: dict[tuple[int, int], object] = {}  # bounds that have passed, by identity and size: often one for all
         for block in layout.blocks:
             i, n = block.agent, block.components
             if isinstance(bounds, Mapping) and i not in bounds:
                 raise DesignError(f"{name} has no bound for agent {self.fleet.ids[i]!r}; give one per target")
             bound = bounds[i] if isinstance(bounds, Mapping) else bounds
+            if (id(bound), n) in known:
+                rows.extend(bound if isinstance(bound, Sequence) else [bound] * n)  # type: ignore[list-item]
+                continue
             if isinstance(bound, type):
                 raise DesignError(
                     f"{name}: expected an instance, got the class {bound.__name__}; write {bound.__name__}(...)"
@@ -323,6 +328,7 @@ class ObserverDesign:
                     f"per state component, got {bound!r}"
                 )
             rows.extend(functions)  # type: ignore[arg-type]
+            known[id(bound), n] = bound  # kept, so that its identity isn't another's
         return tuple(rows)
 
     def require_feasible_start(self, state_radius: FloatArray, input_radius: FloatArray) -> None:

@@ -12,6 +12,7 @@ from khop_env.network import Network
 from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.layout import FloatArray, IntArray
+from khop_env.threads import Range
 
 Take: TypeAlias = Callable[[IntArray, IntArray, FloatArray], None]
 """take(link (C,), row (C,), held (C, B)): copy into `held` what has just come over links, from rows of what is sent."""
@@ -80,6 +81,7 @@ class Relay:
     name = "relay"
     proposed = ""
     width = 0
+    divisible = True
 
     def prepare(self, design: ObserverDesign, network: Network, num_envs: int, first_row: int) -> None:
         """Get ready for the pairs of `design`; the `network`, `num_envs` and `first_row` don't matter."""
@@ -92,15 +94,15 @@ class Relay:
     def reset(self, memory: Memory, env_ids: IntArray, first_guess: FloatArray) -> None:
         """Nothing to do."""
 
-    def predict(self, memory: Memory, t: FloatArray, dt: float) -> None:
+    def predict(self, memory: Memory, t: FloatArray, dt: float, part: Range | None = None) -> None:
         """Nothing to do."""
 
     def message(self, state: PlantState) -> list[FloatArray]:
         """Nothing more."""
         return []
 
-    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_]) -> None:
+    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
         """Nothing to do."""
 
-    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+    def raise_extremes(self, state: PlantState, extremes: Extremes, part: Range | None = None) -> None:
         """No ratios."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.brief import brief
+from khop_env.observers.indexing import find, ranges
 from khop_env.observers.ordering import profile_order
 from khop_env.physics import Links
 
@@ -136,69 +137,61 @@ class PairLayout:
             targets: agents to observe; all by default.
             changing: whether links come and go.
         """
-        senders = links.senders
-        blocks: list[tuple[int, ...]] = []
-        target: list[int] = []
-        observer: list[int] = []
-        relay_count: list[int] = []
-        diagonal: list[int] = []
-        first: list[int] = []
-        last: list[int] = []
-        entry: list[int] = []
-        entry_start = [0]
-        entry_link: list[int] = []
-        relay_start = [0]
-        relay_link: list[int] = []
-        size = rows = 0
-        for i in range(links.agents) if targets is None else sorted(targets):
-            members = profile_order(senders, neighborhoods[i])
-            if not members:
-                continue
-            place = {agent: a for a, agent in enumerate(members)}
-            blocks.append((len(members), dimensions[i], size, offsets[i], rows, len(observer)))
-            target.append(i)
-            for a, agent in enumerate(members):
-                linked = sorted(place[other] for other in senders[agent] if other in place)
-                # under Assumption 4 all neighbours of the target relay its state; otherwise only the target sends it
-                relays = sorted(p for p in senders[agent] if i in senders[p]) if relay else [i] * (i in senders[agent])
-                observer.append(agent)
-                relay_count.append(len(relays))
-                diagonal.append(len(linked) + len(relays))
-                first.append(min(linked[0], a) if linked else a)
-                entry.extend(linked)
-                entry_start.append(len(entry))
-                entry_link.extend(links.index[members[b], agent] for b in linked)
-                relay_link.extend(links.index[p, agent] for p in relays)
-                relay_start.append(len(relay_link))
-                if changing or not links.symmetric:
-                    begin = len(last) - a
-                    last.append(max([a, *linked, *last[begin + first[-1] : begin + a]]))
-            size += len(members) * dimensions[i]
-            rows += dimensions[i]
-        of_target = np.ascontiguousarray(np.array(blocks, dtype=np.int64).reshape(-1, 6).T)
+        n = links.agents
+        ordered = [
+            (i, members)
+            for i in (range(n) if targets is None else sorted(targets))
+            if (members := profile_order(links.senders, neighborhoods[i]))
+        ]
+        target = np.array([i for i, _ in ordered], np.int64)
+        eta = np.array([len(members) for _, members in ordered], np.int64)
+        observer = np.array([agent for _, members in ordered for agent in members], np.int64)
+        dimension = np.array(dimensions, np.int64)[target]
+        first_pair = np.cumsum(eta) - eta
+        whose = np.repeat(np.arange(len(target)), eta)  # place in `target`, of each pair
+        place = np.arange(len(observer)) - first_pair[whose]
+        # every way on which something may come: the links to each pair's observer, by sender
+        fewest = np.searchsorted(links.receiver, np.arange(n + 1))
+        pair, link = ranges(fewest[observer], np.diff(fewest)[observer])
+        sender = links.sender[link]
+        found, other = find(whose[pair] * n + sender, whose * n + observer)
+        pair_of_entry, entry, entry_link = pair[found], place[other[found]], link[found]
+        order = np.lexsort((entry, pair_of_entry))
+        pair_of_entry, entry, entry_link = pair_of_entry[order], entry[order], entry_link[order]
+        # under Assumption 4 all neighbours of the target relay its state; otherwise only the target sends it
+        of_target = target[whose[pair]]
+        relays = sender == of_target
+        if relay:
+            relays, _ = find(sender * n + of_target, links.receiver * n + links.sender)
+        entries, relay_count = (np.bincount(which, minlength=len(observer)) for which in (pair_of_entry, pair[relays]))
+        entry_start = np.concatenate([[0], np.cumsum(entries)])
+        first = place.copy()
+        np.minimum.at(first, pair_of_entry, entry)
         return PairLayout(
             PairArrays(
-                observers=of_target[0],
-                components=of_target[1],
-                column=of_target[2],
-                source=of_target[3],
-                row=of_target[4],
-                pair=of_target[5],
-                relay=np.array(relay_count, dtype=np.float64),
-                diagonal=np.array(diagonal, dtype=np.float64),
-                entry_start=np.array(entry_start, dtype=np.int64),
-                entry=np.array(entry, dtype=np.int64),
-                first=np.array(first, dtype=np.int64),
-                last=np.array(last, dtype=np.int64),
+                observers=eta,
+                components=dimension,
+                column=np.cumsum(eta * dimension) - eta * dimension,
+                source=np.array(offsets, np.int64)[target],
+                row=np.cumsum(dimension) - dimension,
+                pair=first_pair,
+                relay=relay_count.astype(np.float64),
+                diagonal=(entries + relay_count).astype(np.float64),
+                entry_start=entry_start,
+                entry=entry,
+                first=first,
+                last=_last(first, entry_start, entry, first_pair, eta)
+                if changing or not links.symmetric
+                else np.zeros(0, np.int64),
             ),
-            target=np.array(target, dtype=np.int64),
-            observer=np.array(observer, dtype=np.int64),
-            entry_link=np.array(entry_link, dtype=np.int64),
-            relay_start=np.array(relay_start, dtype=np.int64),
-            relay_link=np.array(relay_link, dtype=np.int64),
+            target=target,
+            observer=observer,
+            entry_link=entry_link,
+            relay_start=np.concatenate([[0], np.cumsum(relay_count)]),
+            relay_link=link[relays],
             links=links,
-            size=size,
-            rows=rows,
+            size=int((eta * dimension).sum()),
+            rows=int(dimension.sum()),
         )
 
     @cached_property
@@ -333,3 +326,15 @@ class PairLayout:
 def _joined(parts: Iterable[IntArray]) -> IntArray:
     """The parts after each other; an empty array of none."""
     return np.concatenate([np.zeros(0, np.int64), *parts])
+
+
+def _last(first: IntArray, entry_start: IntArray, entry: IntArray, first_pair: IntArray, eta: IntArray) -> IntArray:
+    """(pairs,) place of the last non-zero of each row of the factors U: fill-in reaches as far as the rows above."""
+    first_, start, entries = first.tolist(), entry_start.tolist(), entry.tolist()
+    last: list[int] = []
+    for begin, count in zip(first_pair.tolist(), eta.tolist(), strict=True):
+        for a in range(count):
+            pair = begin + a
+            linked = entries[start[pair] : start[pair + 1]]
+            last.append(max([a, *linked, *last[begin + first_[pair] : pair]]))
+    return np.array(last, np.int64)

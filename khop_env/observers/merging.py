@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.compiled import compiled
+from khop_env.compiled import compiled, place
+from khop_env.network.rounds import FEW_SLOTS
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 
 TIME = 0  # row of a message's time
@@ -51,7 +52,7 @@ class Sources(NamedTuple):
         first_data = 1 + components_of_all + 2 * (layout.size + layout.pairs)
         column, components = [], []
         for block in layout.blocks:
-            for place, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
+            for number, pair in enumerate(range(block.pairs.start, block.pairs.stop)):
                 own_data = first_data + int(layout.pair_target[pair]) * message_size
                 ways = [
                     (link, 1 + block.sources.start, TIME, -1, -1, own_data)
@@ -65,7 +66,7 @@ class Sources(NamedTuple):
                     ways.append((link, state, stamp, stamp + layout.pairs, state + layout.size, data))
                 found += sorted(ways, key=lambda way: int(sender[way[0]]))
                 start.append(len(found))
-                column.append(block.columns.start + place * block.components)
+                column.append(block.columns.start + number * block.components)
                 components.append(block.components)
         link, state, stamps, hops, errors, data = np.array(found, np.int64).reshape(-1, 6).T.copy()
         first, places, sizes = (np.array(values, np.int64) for values in (start, column, components))
@@ -91,6 +92,8 @@ def merge(
     arrived: FloatArray,
     data: FloatArray,
     lag: FloatArray,
+    low: int,
+    high: int,
 ) -> bool:
     """Take over what is fresher than what is held, from the messages that have just arrived.
 
@@ -113,70 +116,100 @@ def merge(
         arrived: (pairs, B) when; changed.
         data: (pairs * message_size, B) what else the target has sent with that state; changed.
         lag: (pairs, B) time from the message that was taken over to `t`, in s, else 0; written.
+        low: first environment.
+        high: one past the last.
 
     Returns:
         Whether any of these is positive.
     """
     start, link, state, stamp_row, hops_row, error_row, data_row, column, components = sources
-    capacity, batch, message_size = sent.shape[0], t.size, data.shape[0] // max(column.size, 1)
-    choice = np.empty(batch, np.int64)
-    place = np.empty(newest.shape, np.int64)  # in the ring, -1 where nothing is to be read
+    capacity, width, message_size = sent.shape[0], high - low, data.shape[0] // max(column.size, 1)
+    choice, slot_of = np.empty(width, np.int64), np.empty(width, np.int64)
+    slots = np.empty((newest.shape[0], width), np.int64)  # of the ring, -1 where nothing is to be read
+    in_use = np.zeros((newest.shape[0], capacity), np.bool_)
     for over in range(newest.shape[0]):
-        for b in range(batch):
+        for e in range(width):
+            b = place(low + e)
             arrives = heard[over, b] and (newest[over, b] < number[b]) == late
             at = newest[over, b] % capacity
             usable = arrives and sent[at, TIME, b] >= even_since[b] - 1e-12
-            place[over, b] = at if usable else -1
-    behind = False
+            slots[over, e] = at if usable else -1
+            if usable:
+                in_use[over, at] = True
+    behind = 0.0
     for pair in range(column.size):
-        for b in range(batch):
-            choice[b] = -1
-            lag[pair, b] = 0.0
+        for e in range(width):
+            choice[e] = -1
+            lag[pair, place(low + e)] = 0.0
         found = False
         for way in range(start[pair], start[pair + 1]):
             over, row = link[way], stamp_row[way]
-            for b in range(batch):
-                at = place[over, b]
-                if at >= 0 and sent[at, row, b] > stamp[pair, b]:
-                    stamp[pair, b] = sent[at, row, b]
-                    choice[b] = way
-                    found = True
+            if in_use[over].sum() > FEW_SLOTS:
+                found = True
+                for e in range(width):
+                    b, slot = place(low + e), slots[over, e]
+                    if slot >= 0 and sent[slot, row, b] > stamp[pair, b]:
+                        stamp[pair, b] = sent[slot, row, b]
+                        choice[e], slot_of[e] = way, slot
+                continue
+            for slot in range(capacity):
+                if not in_use[over, slot]:
+                    continue
+                found = True
+                for e in range(width):
+                    b = place(low + e)
+                    held, offered = stamp[pair, b], sent[slot, row, b]
+                    fresher = slots[over, e] == slot and offered > held
+                    stamp[pair, b] = offered if fresher else held
+                    choice[e] = way if fresher else choice[e]
+                    slot_of[e] = slot if fresher else slot_of[e]
         if not found:
             continue
         for c in range(components[pair]):  # the batch innermost: neighbouring environments lie side by side
             q = column[pair] + c
-            for b in range(batch):
-                way = choice[b]
+            for e in range(width):
+                way = choice[e]
                 if way >= 0:
-                    at = place[link[way], b]
-                    center[q, b] = sent[at, state[way] + c, b]
-                    error[q, b] = noise if error_row[way] < 0 else sent[at, error_row[way] + c, b]
+                    b = place(low + e)
+                    center[q, b] = sent[slot_of[e], state[way] + c, b]
+                    error[q, b] = noise if error_row[way] < 0 else sent[slot_of[e], error_row[way] + c, b]
         for c in range(message_size):
             q = pair * message_size + c
-            for b in range(batch):
-                way = choice[b]
+            for e in range(width):
+                way = choice[e]
                 if way >= 0:
-                    data[q, b] = sent[place[link[way], b], data_row[way] + c, b]
-        for b in range(batch):
-            way = choice[b]
+                    b = place(low + e)
+                    data[q, b] = sent[slot_of[e], data_row[way] + c, b]
+        for e in range(width):
+            way = choice[e]
             if way >= 0:
-                at = place[link[way], b]
-                hops[pair, b] = 1.0 if hops_row[way] < 0 else sent[at, hops_row[way], b] + 1.0
+                b = place(low + e)
+                hops[pair, b] = 1.0 if hops_row[way] < 0 else sent[slot_of[e], hops_row[way], b] + 1.0
                 arrived[pair, b] = now[b]
-                lag[pair, b] = t[b] - sent[at, TIME, b]
-                behind = behind or lag[pair, b] > 1e-12
-    return behind
+                lag[pair, b] = t[b] - sent[slot_of[e], TIME, b]
+                behind = max(behind, lag[pair, b])
+    return behind > 1e-12
 
 
 @compiled
 def largest_share(
-    column_source: IntArray, estimate: FloatArray, x: FloatArray, bound: FloatArray, largest: FloatArray
+    column_source: IntArray,
+    estimate: FloatArray,
+    x: FloatArray,
+    bound: FloatArray,
+    largest: FloatArray,
+    low: int,
+    high: int,
 ) -> None:
-    """Raise `largest` (B,) to the largest |error| / bound of any estimate (P, B); 0 / 0 counts as 0."""
+    """Raise `largest` (B,) to the largest |error| / bound of any estimate (P, B); 0 / 0 counts as 0.
+
+    In the environments from `low` to `high` - 1.
+    """
     for q in range(column_source.size):
         row = column_source[q]
-        for b in range(largest.size):
+        for e in range(high - low):
+            b = place(low + e)
             error = abs(estimate[q, b] - x[row, b])
             share = error / bound[q, b] if error > 0.0 else 0.0 * error  # a NaN stays, and is reported
-            if not share <= largest[b] and largest[b] == largest[b]:
-                largest[b] = share
+            most = largest[b]
+            largest[b] = share if not share <= most and most == most else most

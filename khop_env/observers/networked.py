@@ -10,25 +10,29 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.network import Channel, Network
 from khop_env.observers.base import Assumptions, Certified, Extremes, Information, Memory, Observers, Plant, PlantState
-from khop_env.observers.certificate import Certificate
-from khop_env.observers.certified import report
+from khop_env.observers.certified import ages, report
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.estimators import Estimator
+from khop_env.observers.exchange import CHANNEL, Exchange
 from khop_env.observers.known_estimators import as_estimator, require_memory, require_own_names
 from khop_env.observers.layout import FloatArray, IntArray
-from khop_env.observers.merging import Sources, largest_share, merge
-from khop_env.observers.reckoning import Reckoning
-from khop_env.physics import AgentModel, hops_from_targets
+from khop_env.observers.merging import Sources, largest_share
+from khop_env.observers.proximal import MOST_THREADS
+from khop_env.observers.reckoning import Reckoning, certificates_of
+from khop_env.observers.solve import LANES
+from khop_env.observers.steps import Plan, Step
+from khop_env.physics import hops_from_targets
+from khop_env.threads import Range, Threads
 
-_CHANNEL = "channel."
+T = TypeVar("T")
 
 
 class Networked:
@@ -44,6 +48,8 @@ class Networked:
         estimator: a name of `ESTIMATORS`, or an `Estimator`.
         message_size: numbers that each agent's policy adds to its message. They are stored and forwarded with its
             state: the memory `said` (N * message_size, B) is sent, `data` (pairs * message_size, B) has arrived.
+        threads: number of threads that share the environments; results don't depend on it. An estimator of your own
+            is called with all of them at once, on one thread.
 
     Attributes:
         network: a `Network`.
@@ -52,7 +58,7 @@ class Networked:
         uncertified: agents whose state has no bound in some component, by index, and why; once prepared.
 
     Raises:
-        ValueError: for an unknown network or estimator.
+        ValueError: for an unknown network or estimator, or if threads is out of range.
     """
 
     name = "networked"
@@ -65,11 +71,15 @@ class Networked:
         network: Network | Mapping[str, object] | str,
         estimator: str | Estimator = "ppso",
         message_size: int = 0,
+        threads: int = 1,
     ) -> None:
         found = Network.of(network)
         if found is None:
             raise ValueError("Networked needs a network, e.g. 'wifi'; without one states are exchanged continuously")
         self.network, self.estimator, self.message_size = found, as_estimator(estimator), message_size
+        if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or not 1 <= threads <= MOST_THREADS:
+            raise ValueError(f"threads must be an integer from 1 to {MOST_THREADS}; got {threads!r}")
+        self.threads = int(threads)
 
     def __repr__(self) -> str:
         return f"Networked({self.network.described()}; {self.estimator.name})"
@@ -78,12 +88,11 @@ class Networked:
         """Allocate buffers, and tabulate the certificates."""
         fleet, layout = design.fleet, design.knowledge
         self.design, self.num_envs, self.layout, self._assumed = design, num_envs, layout, assumed
-        received = _certificates(design, assumed, self.network.noise)
+        received = certificates_of(design, assumed, self.network.noise)
         self.uncertified = {i: each.reason for i, each in enumerate(received) if each.reason}
         self._reckoning = Reckoning(layout, received, num_envs)
         self.longest_step = min(self.network.period, self._reckoning.longest_step)
         sources = Sources.of(layout, fleet.n, len(fleet), self.message_size)
-        self._sources: Any = tuple(sources)
         self._pairs = sources.column, sources.components
         regions = np.concatenate([each.region for each in received])
         self._region = regions[layout.column_source]
@@ -91,17 +100,18 @@ class Networked:
         shared = 1 + fleet.n + 2 * (layout.size + layout.pairs) + self.message_size * (len(fleet) + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         require_memory(self.estimator, sources.components)
+        self._threads = Threads(self.threads)
+        self._ranges = self._threads.ranges(num_envs, LANES)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
+        self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self._threads)
         self._activity = None if design.schedule is None else design.activity()
         self._up = np.ones((len(design.links), num_envs), np.bool_)
-        self._of_memory = [(name, _CHANNEL + name) for name in self.channel.allocate()]
-        self._lag = np.zeros((layout.pairs, num_envs))
         self._fastest = self._fewest_rounds()
+        self._plan_steps()
 
     def allocate(self) -> Memory:
         """Predictions from what was received, its stamps and ways, the estimates, their bounds; channel; estimator."""
         (size, pairs), batch = (self.layout.size, self.layout.pairs), self.num_envs
-        channel = {_CHANNEL + name: values for name, values in self.channel.allocate().items()}
         memory = {
             "estimate": np.zeros((size, batch)),
             "input_estimate": np.zeros((self.design.inputs.layout.size, batch)),
@@ -115,7 +125,7 @@ class Networked:
             "data": np.zeros((pairs * self.message_size, batch)),
             "step": np.zeros(batch),
             "even_since": np.zeros(batch),
-            **channel,
+            **self._exchange.allocate(),
         }
         own = self.estimator.allocate()
         require_own_names(self.estimator, own, memory)
@@ -132,15 +142,14 @@ class Networked:
             memory[name][:, env_ids] = -1.0
         for name in ("hops", "input_estimate", "said", "data", "step", "even_since"):
             memory[name][..., env_ids] = 0.0
-        self.channel.reset(self._of_channel(memory), env_ids, rngs)
-        heard = memory[_CHANNEL + "heard"].copy()
+        channel = self._exchange.of_channel(memory)
+        self.channel.reset(channel, env_ids, rngs)
+        heard = channel["heard"].copy()
         self.estimator.reset(memory, env_ids, first_guess)
         due = np.zeros(self.num_envs, np.bool_)
         due[env_ids] = True
-        self._begin_round(state, due)
-        self._send(state, due)
-        np.copyto(memory[_CHANNEL + "heard"], heard, where=~due)  # the others' last round is as it was
-        self._report(state)
+        self._carry_out(self._first_round, Step(state, channel, due, self.links_up(state)))
+        np.copyto(channel["heard"], heard, where=~due)  # the others' last round is as it was
 
     def advance(self, plant: Plant, before: PlantState, state: PlantState, dt: float) -> None:
         """Advance `state`, a copy of `before`, by `dt` seconds, and run the round that is due then, if any.
@@ -151,38 +160,31 @@ class Networked:
         memory = state.memory
         plant.stage(0, np.array([dt]), dt, before, state)  # first: nothing has changed yet if it raises
         plant.effect(state)
-        due = self.channel.due(self._of_channel(memory), state.t)
-        self._begin_round(state, due)
-        rounds = bool(due.any())
+        channel = self._exchange.of_channel(memory)
+        due = self.channel.due(channel, state.t)
         changed = np.abs(memory["step"] - dt) > 1e-9 * dt
         np.copyto(memory["even_since"], before.t, where=changed)
         memory["step"].fill(dt)
-        if rounds and self.network.most_rounds_late:
-            # as if these messages had arrived at the last grid point, and what they say had been moved from there
-            self._merge(True, state, before.t, dt)
-        self.estimator.predict(memory, before.t, dt)
-        self._reckoning.advance(memory["center"], memory["error"], before.t, dt)
-        if rounds:
-            self._send(state, due)
-        self._report(state)
+        self._carry_out(self._whole_step, Step(state, channel, due, self.links_up(state), before.t, dt))
         plant.actuate(state)
 
     def bound(self, state: PlantState, out: FloatArray) -> Certified:
         """The certified bound: the distance from each estimate to the farther face of its box; inf without one."""
-        np.copyto(out, state.memory["bound"])
+        bound = state.memory["bound"]
+        self._run(lambda part: np.copyto(out[:, slice(*part)], bound[:, slice(*part)]))
         return Certified(out, "certificate")
 
     def links_up(self, state: PlantState) -> NDArray[np.bool_] | None:
         """(L, B) whether each link of the design is up, overwritten by the next call; None where all are, always."""
         if self._activity is None:
             return None
-        return self._activity.up(state.memory[_CHANNEL + "key"], state.t, state.x, self._up)
+        return self._activity.up(state.memory[CHANNEL + "key"], state.t, state.x, self._up)
 
     def information(self, state: PlantState) -> Information:
         """Age, way and time of arrival of the newest state that each pair has received."""
         stamp, arrived = state.memory["stamp"], state.memory["arrived"]
-        nothing = stamp < 0.0
-        age, since = (np.where(nothing, math.inf, state.t - values) for values in (stamp, arrived))
+        age, since = np.empty(stamp.shape), np.empty(stamp.shape)
+        self._run(lambda part: ages(state.t, stamp, arrived, age, since, *part))
         return Information(age, state.memory["hops"], since)
 
     def limits(self, state: PlantState, out: FloatArray) -> FloatArray:
@@ -194,7 +196,7 @@ class Networked:
             `out` (P, B), written.
         """
         h, period = float(state.memory["step"].max()) or self.longest_step, self.network.period
-        round_ = self._of_channel(state.memory)["round"]
+        round_ = state.memory[CHANNEL + "round"]
         rounds = self._fastest[:, None]
         since = np.maximum(state.t - round_ * period, 0.0)
         grid = np.floor((since + rounds * period) / h + 1e-6).astype(np.int64)
@@ -208,69 +210,86 @@ class Networked:
 
     def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
         """Raise running maxima: errors over certified bounds, and the estimator's own |xi| / rho."""
-        largest_share(
-            self.layout.column_source, state.memory["estimate"], state.x, state.memory["bound"], extremes.relative
-        )
-        self.estimator.raise_extremes(state, extremes)
+        source, memory, own = self.layout.column_source, state.memory, self._exchange.own
+
+        def raised(part: Range) -> None:
+            largest_share(source, memory["estimate"], state.x, memory["bound"], extremes.relative, *part)
+            if own is not None:
+                own.raise_extremes(state, extremes, part)
+
+        self._run(raised)
+        if own is None:
+            self.estimator.raise_extremes(state, extremes)
 
     # -- parts ---------------------------------------------------------------------------------------------------
 
-    def _of_channel(self, memory: Memory) -> Memory:
-        return {name: memory[key] for name, key in self._of_memory}
+    def _run(self, work: Callable[[Range], T]) -> list[T]:
+        """Results of `work` on all environments, a range for each thread."""
+        return self._threads.run(work, self._ranges)
 
-    def _begin_round(self, state: PlantState, due: NDArray[np.bool_]) -> None:
-        """Measure what is to be sent, and decide what is lost and what arrives."""
-        channel = self._of_channel(state.memory)
-        self._measured = self.channel.measured(channel, state.x)
-        self.channel.begin_round(channel, self.links_up(state), due)
+    def _plan_steps(self) -> None:
+        """Decide which work may be divided."""
+        own, reckoning = self._exchange.own, self._reckoning.divisible
+        begin = [(Networked._begin, True)]
+        move = [
+            (Networked._catch_up, reckoning),
+            (Networked._predict, own is not None and own.divisible),
+            (Networked._move, reckoning),
+        ]
+        end = [
+            (Networked._compose, own is not None),
+            (Networked._send, True),
+            (Networked._receive, own is not None),
+            (Networked._report, True),
+        ]
+        self._whole_step, self._first_round = Plan([*begin, *move, *end]), Plan([*begin, *end])
 
-    def _send(self, state: PlantState, due: NDArray[np.bool_]) -> None:
-        """Everybody sends what it knows now; messages without delay arrive; the estimator uses what has arrived."""
-        memory, channel = state.memory, self._of_channel(state.memory)
-        shared = [state.t[None], self._measured]
-        shared += [memory[name] for name in ("center", "error", "stamp", "hops", "said", "data")]
-        added = self.estimator.message(state)
-        if sum(map(len, added)) != self.estimator.width:
-            raise ValueError(
-                f"estimator {self.estimator.name!r}: message() has {sum(map(len, added))} rows, its width is "
-                f"{self.estimator.width}"
-            )
-        self.channel.send(channel, [*shared, *added], due)
-        if not self.network.fewest_rounds_late:
-            self._merge(False, state, state.t, 1.0)  # nothing has to be moved
+    def _carry_out(self, plan: Plan[Networked], step: Step) -> None:
+        if self._exchange.own is not None and step.rounds:
+            step.parts = self._exchange.parts(step.state)  # of the library's estimators: here, on one thread
+        plan.carry_out(self, step, self._threads, self._ranges)
 
-        def take(link: IntArray, row: IntArray, held: FloatArray) -> None:
-            self.channel.receive(channel, link, row, held)
+    def _begin(self, step: Step, part: Range) -> None:
+        """Decide what arrives; take over what has been on its way."""
+        self._exchange.begin(step.channel, step.state, step.up, step.due, part)
+        # as if late messages had arrived at the last grid point, and what they say had been moved from there
+        if step.dt and step.rounds and self._exchange.merge_late(step.channel, step.state, step.t, part):
+            step.behind.add(part)
 
-        self.estimator.receive(state, take, due)
+    def _catch_up(self, step: Step, part: Range) -> None:
+        if any(part[0] <= first < part[1] for first, _ in step.behind):
+            memory = step.state.memory
+            lag = self._exchange.lag
+            self._reckoning.catch_up(memory["center"], memory["error"], step.t, lag, step.dt, part)
 
-    def _merge(self, late: bool, state: PlantState, t: FloatArray, dt: float) -> None:
-        """Take over fresher states; `t` is the time that predictions are of."""
-        memory, channel = state.memory, self._of_channel(state.memory)
-        behind = merge(
-            self._sources,
-            late,
-            channel["sent"],
-            channel["round"],
-            channel["newest"],
-            channel["heard"],
-            self.network.noise,
-            memory["even_since"],
-            t,
-            state.t,
-            memory["center"],
-            memory["error"],
-            memory["stamp"],
-            memory["hops"],
-            memory["arrived"],
-            memory["data"],
-            self._lag,
-        )
-        if behind:
-            self._reckoning.catch_up(memory["center"], memory["error"], t, self._lag, dt)
+    def _predict(self, step: Step, part: Range) -> None:
+        own, memory = self._exchange.own, step.state.memory
+        if own is None:
+            self.estimator.predict(memory, step.t, step.dt)
+        else:
+            own.predict(memory, step.t, step.dt, part)
 
-    def _report(self, state: PlantState) -> None:
-        memory = state.memory
+    def _move(self, step: Step, part: Range) -> None:
+        memory = step.state.memory
+        self._reckoning.advance(memory["center"], memory["error"], step.t, step.dt, part)
+
+    def _compose(self, step: Step, part: Range) -> None:
+        if self._exchange.own is None and step.rounds:
+            step.parts = self._exchange.parts(step.state)
+
+    def _send(self, step: Step, part: Range) -> None:
+        if step.rounds:
+            self._exchange.send(step.channel, step.state, step.due, step.parts, part)
+
+    def _receive(self, step: Step, part: Range) -> None:
+        if step.rounds:
+            self._exchange.receive(step.channel, step.state, step.due, part)
+
+    def _report(self, step: Step, part: Range) -> None:
+        self._clip(step.state.memory, part)
+
+    def _clip(self, memory: Memory, part: Range) -> None:
+        """Estimates and bounds, from predictions and what the estimator proposes."""
         report(
             *self._pairs,
             self.estimator.proposal,
@@ -280,6 +299,7 @@ class Networked:
             memory[self.estimator.proposed] if self.estimator.proposed else memory["center"],
             memory["estimate"],
             memory["bound"],
+            *part,
         )
 
     def _fewest_rounds(self) -> FloatArray:
@@ -300,23 +320,7 @@ def missed_rounds(observers: Observers, state: PlantState) -> FloatArray:
     """
     if not isinstance(observers, Networked):
         return np.zeros((len(observers.layout.links), len(state.t)))
-    network, newest = observers.network, state.memory[_CHANNEL + "newest"]
+    network, newest = observers.network, state.memory[CHANNEL + "newest"]
     on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
-    missed = state.memory[_CHANNEL + "round"] - newest - on_time
+    missed = state.memory[CHANNEL + "round"] - newest - on_time
     return np.where(newest < 0, math.inf, np.maximum(missed, 0))
-
-
-def _certificates(design: ObserverDesign, assumed: Assumptions, noise: float) -> list[Certificate]:
-    """Per agent the certificate of a state that it sent; equal ones are one object."""
-    made: dict[tuple[AgentModel, bytes, bytes], Certificate] = {}
-    found = []
-    reach = np.abs(assumed.center) + assumed.radius
-    for i, model in enumerate(design.fleet.models):
-        part = design.fleet.state_slice(i)
-        disturbance = assumed.disturbance[part]
-        region = model.operating_region(reach[part], disturbance)
-        key = model, disturbance.tobytes(), region.tobytes()
-        if key not in made:
-            made[key] = Certificate(model, disturbance=disturbance, start=noise, region=region)
-        found.append(made[key])
-    return found

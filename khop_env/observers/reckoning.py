@@ -11,27 +11,22 @@ wherever -h df_j/dx_j <= 1, which `longest_step` keeps (docs/theory/certificates
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from khop_env.compiled import compiled
+from khop_env.compiled import compiled, place
+from khop_env.observers.base import Assumptions
 from khop_env.observers.certificate import Certificate
 from khop_env.observers.dead_reckoning import extended_drift
+from khop_env.observers.design import ObserverDesign
+from khop_env.observers.drifts import Drift, Drifts
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
-from khop_env.physics import AgentModel, read_only
+from khop_env.physics import AgentModel
+from khop_env.threads import Range
 
 _ROUNDING = 1e-15  # of a state, per step
-
-
-class _Run(NamedTuple):
-    """Consecutive targets with equal models that drift."""
-
-    drift: Callable[[FloatArray, FloatArray], FloatArray]
-    columns: slice
-    pairs: slice
-    components: int
 
 
 class Reckoning:
@@ -44,27 +39,23 @@ class Reckoning:
 
     Attributes:
         longest_step: longest interval, in s.
+        divisible: as that of `Drifts`: whether ranges of environments may be moved one by one, in several threads.
     """
 
     def __init__(self, layout: PairLayout, certificates: Sequence[Certificate], num_envs: int) -> None:
-        self._num_envs, self._layout = num_envs, layout
+        self._layout = layout
         of_targets = [certificates[i] for i in layout.target.tolist()]
         self.longest_step = min((each.longest_step for each in of_targets), default=math.inf)
-        self._runs: list[_Run] = []
-        last: tuple[AgentModel, bytes] | None = None
         matrices: list[FloatArray] = []
+        drifts: list[Drift | None] = []
         for block, certificate in zip(layout.blocks, of_targets, strict=True):
             model, growth, n = certificate.model, certificate.growth, block.components
-            region = certificate.region.tobytes()
             matrices.append(np.zeros((n, n)) if growth is None else growth.matrix)
-            if growth is not None and not growth.matrix.any() and not growth.spread.any():
-                continue
-            columns, pairs = block.columns, block.pairs
-            if last == (model, region) and self._runs[-1].columns.stop == columns.start:
-                first = self._runs.pop()
-                columns, pairs = slice(first.columns.start, columns.stop), slice(first.pairs.start, pairs.stop)
-            self._runs.append(_Run(extended_drift(model, growth), columns, pairs, n))
-            last = model, region
+            still = growth is not None and not growth.matrix.any() and not growth.spread.any()
+            function = extended_drift(model, growth)
+            drifts.append(None if still else Drift(model, function, certificate.region.tobytes()))
+        self._drifts = Drifts(layout, drifts, num_envs)
+        self.divisible = self._drifts.divisible
         nothing = [np.zeros(0)]
         arrays = layout.arrays
         self._arrays: Any = (
@@ -83,20 +74,33 @@ class Reckoning:
             ),
         )
         self._rate = np.zeros((layout.size, num_envs))
-        self._length = np.zeros((layout.pairs, num_envs))
+        self._length, self._h = np.zeros((layout.pairs, num_envs)), np.zeros((1, num_envs))
 
-    def advance(self, p: FloatArray, r: FloatArray, t: FloatArray, h: float) -> None:
-        """Move predictions `p` (P, B) and errors `r` (P, B) from the times `t` (B,) by `h` seconds, in place."""
-        self._length.fill(h)
-        self._move(p, r, t[:, None])
+    def advance(self, p: FloatArray, r: FloatArray, t: FloatArray, h: float, part: Range) -> None:
+        """Move predictions and errors by one interval, in place.
 
-    def catch_up(self, p: FloatArray, r: FloatArray, t: FloatArray, lag: FloatArray, h: float) -> None:
+        Args:
+            p: (P, B) predictions; changed.
+            r: (P, B) their errors; changed.
+            t: (B,) times before, in s.
+            h: length of the interval in s.
+            part: environments in which to do so.
+        """
+        low, high = part
+        self._h[:, low:high] = h
+        self._drifts.evaluate(p, t[low:high, None], self._rate, part)
+        move(self._arrays, self._h, self._rate, p, r, low, high)
+
+    def catch_up(self, p: FloatArray, r: FloatArray, t: FloatArray, lag: FloatArray, h: float, part: Range) -> None:
         """Move what is `lag` (pairs, B) seconds old to the times `t` (B,), in intervals of about `h`, as `advance`."""
+        low, high = part
+        t, lag, length = t[low:high], lag[:, low:high], self._length[:, low:high]
         intervals = np.where(lag > 1e-9 * h, np.maximum(1.0, np.rint(lag / h)), 0.0)
         for number in range(int(intervals.max(initial=0.0))):
             with np.errstate(invalid="ignore", divide="ignore"):
-                self._length[...] = np.where(intervals > number, lag / intervals, 0.0)
-            self._move(p, r, (t - lag + number * self._length).T)
+                length[...] = np.where(intervals > number, lag / intervals, 0.0)
+            self._drifts.evaluate(p, (t - lag + number * length).T, self._rate, part)
+            move(self._arrays, self._length, self._rate, p, r, low, high)
 
     def radii(self, steps: IntArray, start: FloatArray, h: float) -> FloatArray:
         """(P, B) certified errors `steps` (pairs, B) intervals of `h` seconds after errors `start` (P,)."""
@@ -105,47 +109,59 @@ class Reckoning:
         out = np.broadcast_to(r, steps.shape).copy()
         zero, length = np.zeros_like(r), np.full((self._layout.pairs, 1), h)
         for number in range(int(steps.max(initial=0))):
-            move(self._arrays, length, zero, zero, r)
+            move(self._arrays, length, zero, zero, r, 0, 1)
             np.copyto(out, r, where=steps == number + 1)
         return out
 
-    def _move(self, p: FloatArray, r: FloatArray, t: FloatArray) -> None:
-        for run in self._runs:
-            count = run.pairs.stop - run.pairs.start
-            states = read_only(p[run.columns].T.reshape(self._num_envs, count, run.components))
-            times = read_only(t[:] if t.shape[1] == 1 else t[:, run.pairs])
-            self._rate[run.columns] = run.drift(times, states).reshape(self._num_envs, -1).T
-        move(self._arrays, self._length, self._rate, p, r)
-
 
 @compiled
-def move(arrays: Any, length: FloatArray, rate: FloatArray, p: FloatArray, r: FloatArray) -> None:
-    """Move predictions, p += h rate, and certified errors r; `length` (pairs, B) is h, of 0 where nothing moves."""
+def move(arrays: Any, length: FloatArray, rate: FloatArray, p: FloatArray, r: FloatArray, first: int, end: int) -> None:
+    """Move predictions, p += h rate, and certified errors r, in the environments from `first` to `end` - 1.
+
+    `length` is h, 0 where nothing moves: (pairs, B), or (1, B) for all pairs alike.
+    """
     observers, components, columns, pairs, rows, starts, matrix, spread, pushed = arrays
-    batch = p.shape[1]
+    width, alike = end - first, length.shape[0] == 1
     most = 1
     for i in range(components.size):
         most = max(most, components[i])
-    before = np.empty((most, batch))
+    before, growing = np.empty((most, width)), np.empty(width)
     for i in range(observers.size):
         n = components[i]
         for a in range(observers[i]):
-            pair, column = pairs[i] + a, columns[i] + a * n
+            column, of_length = columns[i] + a * n, 0 if alike else pairs[i] + a
             for c in range(n):
-                for b in range(batch):
-                    before[c, b] = r[column + c, b]
+                for e in range(width):
+                    before[c, e] = r[column + c, place(first + e)]
             for c in range(n):
                 q, row = column + c, rows[i] + c
                 most_apart, c_bar = spread[row], pushed[row]
-                for b in range(batch):
-                    r[q, b] = 0.0
+                for e in range(width):
+                    growing[e] = 0.0
                 for k in range(n):
                     slope = matrix[starts[i] + c * n + k]
                     if slope != 0.0:
-                        for b in range(batch):
-                            r[q, b] += slope * before[k, b]
-                for b in range(batch):
-                    h = length[pair, b]
-                    wider = h * (min(r[q, b], most_apart) + c_bar) + _ROUNDING * abs(p[q, b])
-                    r[q, b] = before[c, b] + (wider if h > 0.0 and before[c, b] < math.inf else 0.0)
+                        for e in range(width):
+                            growing[e] += slope * before[k, e]
+                for e in range(width):
+                    b = place(first + e)
+                    h = length[of_length, b]
+                    wider = h * (min(growing[e], most_apart) + c_bar) + _ROUNDING * abs(p[q, b])
+                    r[q, b] = before[c, e] + (wider if h > 0.0 and before[c, e] < math.inf else 0.0)
                     p[q, b] += h * rate[q, b]
+
+
+def certificates_of(design: ObserverDesign, assumed: Assumptions, noise: float) -> list[Certificate]:
+    """Per agent the certificate of a state that it sent; equal ones are one object."""
+    made: dict[tuple[AgentModel, bytes, bytes], Certificate] = {}
+    found = []
+    reach = np.abs(assumed.center) + assumed.radius
+    for i, model in enumerate(design.fleet.models):
+        part = design.fleet.state_slice(i)
+        disturbance = assumed.disturbance[part]
+        region = model.operating_region(reach[part], disturbance)
+        key = model, disturbance.tobytes(), region.tobytes()
+        if key not in made:
+            made[key] = Certificate(model, disturbance=disturbance, start=noise, region=region)
+        found.append(made[key])
+    return found

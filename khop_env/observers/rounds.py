@@ -16,14 +16,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.compiled import compiled, place
 from khop_env.network import Network
 from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
+from khop_env.observers.drifts import Drift, Drifts
 from khop_env.observers.estimators import Take
-from khop_env.observers.funnel_observers import WidthsNow
+from khop_env.observers.indexing import ranges
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
-from khop_env.observers.prediction import Prediction
 from khop_env.observers.scalar import solve_alone
+from khop_env.threads import Range
 
 
 class _Held(NamedTuple):
@@ -50,7 +52,10 @@ class Rounds:
     What is held is used as it came: neither predicted nor aged. All of its memory begins with "ppso.": "estimate" and
     "input_estimate", "held" and "input_held" of other agents, "neighbor_input", the inputs last heard of neighbours,
     and of the last round "eps", "input_eps" and the disagreements over their funnels, "normalized" and
-    "input_normalized".
+    "input_normalized". Methods also work on a `part` of the environments and touch no others.
+
+    Attributes:
+        divisible: as that of `Drifts`: whether `predict` may be called so in several threads at once; once prepared.
     """
 
     name = "ppso"
@@ -61,7 +66,7 @@ class Rounds:
 
         Rounds last the `network`'s period, in `num_envs` environments.
         """
-        self._design, self._num_envs, self._period = design, num_envs, network.period
+        self._design, self._num_envs, self._period, self._all = design, num_envs, network.period, (0, num_envs)
         fleet, knowledge, states, inputs = design.fleet, design.knowledge, design.states.layout, design.inputs.layout
         self.proposal = np.array(
             [
@@ -87,9 +92,18 @@ class Rounds:
         heard = {pair: neighbor_input + start for pair, start in place.items()}
         self._states = _held(states, estimate, 1, known)
         self._inputs = _held(inputs, input_estimate, own_input, heard)
-        self._rho, self._omega = WidthsNow(design.states.rho, num_envs), WidthsNow(design.inputs.rho, num_envs)
-        self._prediction = Prediction(design, num_envs)
+        self._rho, self._omega = np.ones((states.rows, num_envs)), np.ones((inputs.rows, num_envs))
+        known_drifts = [
+            Drift(fleet.models[i], fleet.models[i].drift) if design.options[i].drift else None
+            for i in states.target.tolist()
+        ]
+        self._drifts = Drifts(states, known_drifts, num_envs)
+        self.divisible = self._drifts.divisible
         self._rate = np.zeros((states.size, num_envs))
+        self._input = np.full(states.size, -1)  # row of the input estimate that belongs to each estimate
+        for who, first in inputs.slot.items():
+            n = fleet.models[who[1]].n
+            self._input[states.slot[who] : states.slot[who] + n] = np.arange(first, first + n)
 
     def allocate(self) -> Memory:
         """See the class."""
@@ -113,21 +127,23 @@ class Rounds:
         memory["ppso.estimate"][:, env_ids] = first_guess[self._design.states.layout.column_source][:, None]
         memory["ppso.held"][:, env_ids] = first_guess[self._states.source][:, None]
 
-    def predict(self, memory: Memory, t: FloatArray, dt: float) -> None:
+    def predict(self, memory: Memory, t: FloatArray, dt: float, part: Range | None = None) -> None:
         """Y += dt (f(y) + g_hat), explicit Euler as in the proximal step of order 1."""
+        low, high = part or self._all
         estimate = memory["ppso.estimate"]
-        self._prediction.rate(t, estimate, memory["ppso.input_estimate"], self._rate)
-        self._rate *= dt
-        estimate += self._rate
+        self._drifts.evaluate(estimate, t[low:high, None], self._rate, (low, high))
+        predict(self._rate, memory["ppso.input_estimate"], self._input, dt, estimate, low, high)
 
     def message(self, state: PlantState) -> list[FloatArray]:
         """Own inputs' effects, estimates of states and inputs, and the inputs' effects last heard of neighbours."""
         memory = state.memory
+        self._design.states.rho.evaluate(state.t, self._rho)  # for `receive`
+        self._design.inputs.rho.evaluate(state.t, self._omega)
         return [state.g, *(memory[f"ppso.{name}"] for name in ("estimate", "input_estimate", "neighbor_input"))]
 
-    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_]) -> None:
+    def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
         """Hold what has come, and solve in the environments that are `due`."""
-        memory, design = state.memory, self._design
+        memory, design, (low, high) = state.memory, self._design, part or self._all
         take(self._input_link, self._input_row, memory["ppso.neighbor_input"])
         for held, funnels, widths, name in (
             (self._states, design.states, self._rho, ""),
@@ -143,23 +159,51 @@ class Rounds:
                 held.offset,
                 self._period,
                 values,
-                widths.at(state.t),
+                widths,
                 due,
                 memory[f"ppso.{name}eps"],
                 memory[f"ppso.{name}estimate"],
                 memory[f"ppso.{name}normalized"],
+                low,
+                high,
             )
-        memory["input_estimate"][...] = memory["ppso.input_estimate"]
+        memory["input_estimate"][:, low:high] = memory["ppso.input_estimate"][:, low:high]
 
-    def raise_extremes(self, state: PlantState, extremes: Extremes) -> None:
+    def raise_extremes(self, state: PlantState, extremes: Extremes, part: Range | None = None) -> None:
         """Raise the largest |xi| / rho and |mu| / omega, of the disagreements at the last round."""
-        for name, largest in (
-            ("ppso.normalized", extremes.normalized),
-            ("ppso.input_normalized", extremes.input_normalized),
-        ):
-            values = state.memory[name]
-            if len(values):
-                np.maximum(largest, np.abs(values).max(axis=0), out=largest)
+        memory, (low, high) = state.memory, part or self._all
+        largest_size(memory["ppso.normalized"], extremes.normalized, low, high)
+        largest_size(memory["ppso.input_normalized"], extremes.input_normalized, low, high)
+
+
+@compiled
+def predict(
+    rate: FloatArray, inputs: FloatArray, input_of: IntArray, dt: float, estimate: FloatArray, low: int, high: int
+) -> None:
+    """Move estimates (P, B) by `dt` s at their rates (P, B) plus rows `input_of` (P,) of `inputs`, -1 for none.
+
+    In environments `low` to `high` - 1.
+    """
+    for q in range(estimate.shape[0]):
+        own = input_of[q]
+        if own < 0:
+            for e in range(high - low):
+                b = place(low + e)
+                estimate[q, b] += rate[q, b] * dt
+        else:
+            for e in range(high - low):
+                b = place(low + e)
+                estimate[q, b] += (rate[q, b] + inputs[own, b]) * dt
+
+
+@compiled
+def largest_size(values: FloatArray, largest: FloatArray, low: int, high: int) -> None:
+    """Raise `largest` (B,) to the largest |value| of any row (rows, B), in environments `low` to `high` - 1."""
+    for q in range(values.shape[0]):
+        for e in range(high - low):
+            b = place(low + e)
+            size, most = abs(values[q, b]), largest[b]
+            largest[b] = size if not size <= most and most == most else most  # a NaN stays
 
 
 def _held(layout: PairLayout, estimate: int, own: int, relayed: dict[tuple[int, int], int]) -> _Held:
@@ -171,25 +215,22 @@ def _held(layout: PairLayout, estimate: int, own: int, relayed: dict[tuple[int, 
         own: row at which the fleet's own values begin.
         relayed: (relaying agent, target) -> row of the target's value in what that agent sends.
     """
-    arrays, sender = layout.arrays, layout.links.sender
-    link, row, source, offset = list[int](), list[int](), list[int](), list[int]()
-    start = [0]
-    for block in layout.blocks:
-        span = range(block.components)
-        for pair in range(block.pairs.start, block.pairs.stop):
-            offset.append(len(link))
-            entries = range(arrays.entry_start[pair], arrays.entry_start[pair + 1])
-            ways = [
-                (int(layout.entry_link[k]), estimate + block.columns.start + int(arrays.entry[k]) * block.components)
-                for k in entries
-            ]
-            for number in layout.relay_link[layout.relay_start[pair] : layout.relay_start[pair + 1]].tolist():
-                p, i = int(sender[number]), block.agent
-                ways.append((number, own + block.sources.start if p == i else relayed[p, i]))
-            for number, first in ways:
-                link += [number] * block.components
-                row += [first + c for c in span]
-                source += [block.sources.start + c for c in span]
-            start.append(start[-1] + len(ways))
-    parts = (link, row, start, offset, source)
-    return _Held(*(np.array(part, np.int64) for part in parts))
+    arrays, count = layout.arrays, layout.pairs
+    target, components = layout.pair_target, np.repeat(arrays.components, arrays.observers)
+    columns, sources = (np.repeat(each, arrays.observers) for each in (arrays.column, arrays.source))
+    of_entry = np.repeat(np.arange(count), np.diff(arrays.entry_start))
+    of_relay = np.repeat(np.arange(count), np.diff(layout.relay_start))
+    relaying = zip(layout.links.sender[layout.relay_link].tolist(), target[of_relay].tolist(), strict=True)
+    own_values = (own + sources[of_relay]).tolist()
+    relays = [value if p == i else relayed[p, i] for (p, i), value in zip(relaying, own_values, strict=True)]
+    pair = np.concatenate([of_entry, of_relay])
+    order = np.argsort(pair, kind="stable")
+    pair = pair[order]
+    link = np.concatenate([layout.entry_link, layout.relay_link])[order]
+    first = np.concatenate([estimate + columns[of_entry] + arrays.entry * components[of_entry], relays])[order]
+    size = components[pair]  # of each value that is held
+    start = np.concatenate([[0], np.cumsum(np.bincount(pair, minlength=count))])
+    way, row = ranges(first.astype(np.int64), size)
+    _, source = ranges(sources[pair], size)
+    offset = np.concatenate([[0], np.cumsum(size)])[start[:-1]]
+    return _Held(link[way], row, start, offset, source)

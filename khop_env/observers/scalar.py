@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.compiled import compiled, place
+from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import expm1
 from khop_env.observers.barrier import barrier, eps_near_impulse
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays
@@ -17,6 +17,7 @@ _FEW, _MANY = 8, 100  # iterations from a warm start; between bounds, where bise
 _SMALL = 1e-6  # in eps: the error after such a step of Newton's method is its square
 _EXACT = 4e-16
 _LONGEST = 4.0
+_JUMP = 0.5  # in eps: beyond it a warm start is no better than a new start
 
 
 @compiled
@@ -31,6 +32,8 @@ def solve_alone(
     eps: FloatArray,
     estimate: FloatArray,
     normalized: FloatArray,
+    low: int,
+    high: int,
 ) -> None:
     """Solve y - y* + tau z / rho = 0, z = phi'(e), e = (d y - sum of what is held) / rho, for every pair.
 
@@ -47,43 +50,76 @@ def solve_alone(
         eps: (P, B) T(e); the last one on entry, the new one on return.
         estimate: (P, B) y* on entry, y on return.
         normalized: (P, B) e, written.
+        low: first environment.
+        high: one past the last.
     """
     pairs = PairArrays(*pairs)
-    batch = due.size
     lanes = np.empty((10, LANES))
     target, weight, inverse, total = lanes[0], lanes[1], lanes[2], lanes[3]
     u, active, answer = lanes[4], lanes[5], lanes[6]
     steps, slope, at_u = lanes[7], lanes[8], lanes[9]
+    columns, rows, sources = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    last = 0
     for i in range(pairs.observers.size):
-        n = pairs.components[i]
-        for a in range(pairs.observers[i]):
-            pair = pairs.pair[i] + a
-            sources = start[pair + 1] - start[pair]
-            d = float(sources)
-            for c in range(n):
-                column, row = pairs.column[i] + a * n + c, pairs.row[i] + c
-                for first in range(0, batch, LANES):
-                    width = min(LANES, batch - first)
-                    for lane in range(width):
-                        total[lane] = 0.0
-                    for k in range(sources):
+        last += pairs.observers[i] * pairs.components[i]
+    for first in range(low, high, LANES):
+        width = min(LANES, high - first)
+        waiting = 0
+        for e in range(width):
+            waiting += due[place(first + e)]
+        if waiting == 0:
+            continue
+        beside = LANES // width  # equations of few environments are solved side by side
+        filled = done = 0
+        for i in range(pairs.observers.size):
+            n = pairs.components[i]
+            for a in range(pairs.observers[i]):
+                pair = pairs.pair[i] + a
+                count = start[pair + 1] - start[pair]
+                d = float(count)
+                for c in range(n):
+                    column, row, origin = pairs.column[i] + a * n + c, pairs.row[i] + c, filled * width
+                    for e in range(width):
+                        total[place(origin + e)] = 0.0
+                    for k in range(count):
                         source = offset[pair] + k * n + c
-                        for lane in range(width):
-                            total[lane] += held[source, place(first + lane)]
-                    for lane in range(width):
-                        at = place(first + lane)
+                        for e in range(width):
+                            total[place(origin + e)] += held[source, place(first + e)]
+                    for e in range(width):
+                        lane, at = place(origin + e), place(first + e)
                         inverse[lane] = 1.0 / rho[row, at]
                         target[lane] = (d * estimate[column, at] - total[lane]) * inverse[lane]
                         weight[lane] = d * tau * inverse[lane] * inverse[lane]
                         u[lane] = eps[column, at]
-                    _solve_lanes(width, target, weight, u, active, steps, slope, at_u, answer)
-                    for lane in range(width):
-                        at = place(first + lane)
-                        if due[at]:
-                            eps[column, at] = u[lane]
-                            normalized[column, at] = answer[lane]
-                            # from e, not from z: no digits are lost in stiff equations
-                            estimate[column, at] = (total[lane] + rho[row, at] * answer[lane]) / d
+                    columns[filled], rows[filled], sources[filled] = column, row, count
+                    filled += 1
+                    done += 1
+                    if filled < beside and done < last:
+                        continue
+                    _solve_lanes(filled * width, target, weight, u, active, steps, slope, at_u, answer)
+                    for f in range(filled):
+                        column_f, row_f, d_f = columns[f], rows[f], float(sources[f])
+                        for e in range(width):
+                            lane, at = place(f * width + e), place(first + e)
+                            if due[at]:
+                                eps[column_f, at] = u[lane]
+                                normalized[column_f, at] = answer[lane]
+                                # from e, not from z: no digits are lost in stiff equations
+                                estimate[column_f, at] = (total[lane] + rho[row_f, at] * answer[lane]) / d_f
+                    filled = 0
+
+
+@inlined
+def _near(target: float, weight: float) -> float:
+    """The solution for e = z / (4 + |z|), which is near phi's, so that Halley's method needs a few iterations at most.
+
+    At most 4, in 400 000 random equations with b from 1e-6 to 1e6 and s d from 1e-10 to 1e6.
+    """
+    b = abs(target)
+    p = 4.0 * weight + 1.0 - b
+    root = math.sqrt(p * p + 16.0 * weight * b)
+    z = 8.0 * b / (p + root) if p > 0.0 else (root - p) / (2.0 * weight)
+    return eps_near_impulse(math.copysign(z, target))
 
 
 @compiled
@@ -98,7 +134,10 @@ def _solve_lanes(
     normalized: FloatArray,
     answer: FloatArray,
 ) -> None:
-    """Halley's method in eps from warm starts `u`; where it isn't quick, anew between bounds. Writes u and e.
+    """Halley's method in eps from warm starts `u`, or near the solution where these are far from it. Writes u and e.
+
+    Where it isn't quick, the solution is found between bounds.
+
 
     With q = de/deps = (1 - e^2) / 2 and z = eps / q, the excess F = e + s d z - b and its derivatives, times q, are
 
@@ -106,7 +145,7 @@ def _solve_lanes(
     """
     for lane in range(width):
         active[lane] = 1.0
-    for _ in range(_FEW):
+    for iteration in range(_FEW):
         for lane in range(width):  # arithmetic alone, which runs in vector registers
             eps, sd = u[lane], weight[lane]
             size = abs(eps)
@@ -131,6 +170,14 @@ def _solve_lanes(
             answer[lane] = normalized[lane] - slope[lane] * step if on > 0.0 else answer[lane]
             active[lane] = on if abs(step) > _SMALL else 0.0
             moving += active[lane]
+        if iteration == 0:
+            far = 0.0
+            for lane in range(width):
+                far += 1.0 if abs(steps[lane]) > _JUMP else 0.0  # counted: a NaN is a lane's own
+            if far > 0.0:
+                for lane in range(width):
+                    near = _near(target[lane], weight[lane])
+                    u[lane] = near if abs(steps[lane]) > _JUMP else u[lane]
         if moving == 0.0:
             break
     for lane in range(width):

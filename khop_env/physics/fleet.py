@@ -98,7 +98,8 @@ class Fleet:
         self.position_index: IndexArray = np.array(positions) + self.state_offset[:-1, None]
         self.input_limit: FloatArray = np.concatenate([model.input_limit for model in self.models])
         for group in self.groups:
-            group.model.check_drift()
+            if group.model.form is None:
+                group.model.check_drift()
         self.input_map_bound: FloatArray = np.concatenate(
             [np.tile(group.model.checked_input_map_bound(), group.size) for group in self.groups]
         )

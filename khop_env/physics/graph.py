@@ -6,13 +6,13 @@ directed graph an edge b -> a is a link: agent a hears agent b.
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterable
 
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.compiled import compiled
 from khop_env.physics.agent_model import FloatArray
 
 _LISTED = 8  # entries of a long list that an error message lists
@@ -223,53 +223,75 @@ def random_geometric_graph(agents: int, mean_degree: float, rng: np.random.Gener
     points = rng.uniform(0.0, np.sqrt(agents), (agents, 2))
     graph = nx.Graph()
     graph.add_nodes_from(range(agents))
-    radius2 = mean_degree / np.pi
-    rows = max(1, 2**22 // agents)  # 32 MiB of distances at a time
-    for first in range(0, agents, rows):
-        block = points[first : first + rows]
-        distance2 = _squared_distances(block, points[first:])
-        row, column = np.nonzero(distance2 < radius2)
-        later = column > row
-        graph.add_edges_from(zip((row[later] + first).tolist(), (column[later] + first).tolist(), strict=True))
+    row, column, _ = _pairs_within(points, mean_degree / np.pi)
+    graph.add_edges_from(zip(row.tolist(), column.tolist(), strict=True))
     graph.add_edges_from(_minimum_spanning_tree(points))
     return graph, points
 
 
+def _pairs_within(points: FloatArray, radius2: float) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Pairs i < j of points less than a radius apart, sorted, and their squared distances.
+
+    Squares of a grid are no narrower than the radius, so that a point's partners are in its own square and the eight
+    around it: time and memory grow with the number of points, not with its square, while the radius stays the same.
+    """
+    width = max(np.sqrt(radius2) * (1.0 + 1e-9), 1.0)  # more than the radius, however it is rounded; few empty squares
+    square = np.floor(points / width).astype(np.int64)
+    stride = int(square[:, 1].max()) + 3  # a margin: squares outside the others are empty
+    key = (square[:, 0] + 1) * stride + square[:, 1] + 1
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    found = []
+    for step in (-stride, 0, stride):  # three squares above each other are next to each other in `ordered`
+        first = np.searchsorted(ordered, key + step - 1, "left")
+        count = np.searchsorted(ordered, key + step + 1, "right") - first
+        row = np.repeat(np.arange(len(points)), count)
+        column = order[np.arange(len(row)) + np.repeat(first - np.cumsum(count) + count, count)]
+        row, column = row[column > row], column[column > row]
+        away = points[row] - points[column]
+        distance2 = away[:, 0] * away[:, 0] + away[:, 1] * away[:, 1]
+        near = distance2 < radius2
+        found.append((row[near], column[near], distance2[near]))
+    row, column, distance2 = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    order = np.lexsort((column, row))
+    return row[order], column[order], distance2[order]
+
+
 def _minimum_spanning_tree(points: FloatArray) -> list[tuple[int, int]]:
-    """Edges of the Euclidean minimum spanning tree, by Prim's algorithm: O(N^2) time, O(N) memory."""
-    edges = np.zeros((len(points) - 1, 2), np.int64)
-    _prim(points, edges)
-    return [(a, b) for a, b in edges.tolist()]
+    """Edges of the Euclidean minimum spanning tree, from the tree's agent to the new one, by Prim's algorithm.
+
+    It needs short edges only: those within the smallest of a sequence of radii at which all agents are connected.
+    """
+    radius2 = 2.0  # where agents have unit density, six are within
+    while True:
+        edges = _tree_of(len(points), *_pairs_within(points, radius2))
+        if len(edges) == len(points) - 1:
+            return edges
+        radius2 *= 2.0
 
 
-@compiled
-def _prim(points: FloatArray, edges: NDArray[np.int64]) -> None:
-    """Edges (N - 1, 2), from the tree's agent to the new one, in the order in which they are found."""
-    agents = len(points)
-    distance2 = np.full(agents, np.inf)  # squared, to the tree
-    parent = np.zeros(agents, np.int64)
-    outside = np.ones(agents, np.bool_)
-    newest = 0
-    for edge in range(agents - 1):
-        outside[newest] = False
-        x, y = points[newest]
-        nearest = -1
-        for agent in range(agents):
-            if outside[agent]:
-                dx, dy = x - points[agent, 0], y - points[agent, 1]
-                away2 = dx * dx + dy * dy
-                if away2 < distance2[agent]:
-                    distance2[agent], parent[agent] = away2, newest
-                if nearest < 0 or distance2[agent] < distance2[nearest]:
-                    nearest = agent
-        edges[edge, 0], edges[edge, 1] = parent[nearest], nearest
-        newest = nearest
-
-
-def _squared_distances(a: FloatArray, b: FloatArray) -> FloatArray:
-    x = a[:, None, 0] - b[:, 0]
-    y = a[:, None, 1] - b[:, 1]
-    return np.asarray(x * x + y * y)
+def _tree_of(
+    agents: int, row: NDArray[np.int64], column: NDArray[np.int64], distance2: FloatArray
+) -> list[tuple[int, int]]:
+    """The minimum spanning tree of what agent 0 reaches along these edges; of agents as close the lower ones first."""
+    near: list[list[tuple[int, float]]] = [[] for _ in range(agents)]
+    for a, b, away2 in zip(row.tolist(), column.tolist(), distance2.tolist(), strict=True):
+        near[a].append((b, away2))
+        near[b].append((a, away2))
+    closest, parent = [np.inf] * agents, [0] * agents  # squared distance to the tree; -1 inside it
+    edges, waiting = list[tuple[int, int]](), [(0.0, 0)]
+    while waiting:
+        _, newest = heapq.heappop(waiting)
+        if closest[newest] < 0.0:
+            continue
+        closest[newest] = -1.0
+        if newest:
+            edges.append((parent[newest], newest))
+        for agent, away2 in near[newest]:
+            if away2 < closest[agent]:
+                closest[agent], parent[agent] = away2, newest
+                heapq.heappush(waiting, (away2, agent))
+    return edges
 
 
 def _require_hops(k: object) -> None:

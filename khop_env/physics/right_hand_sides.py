@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled, place
+from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import cos, sin, tanh
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ def velocity_inputs(runs: Any, x: FloatArray, velocity: FloatArray, out: FloatAr
             v += size
 
 
-@compiled
+@inlined
 def drifter_drift(agents: int, row: int, x: FloatArray, out: FloatArray, low: int, high: int) -> None:
     """`DriftingIntegrator.drift`; the loop runs along whichever axis is longer, so that it vectorises."""
     width = high - low
@@ -188,7 +188,7 @@ def drifter_drift(agents: int, row: int, x: FloatArray, out: FloatArray, low: in
                 out[r, e] = sin(0.5 * (x[place(row + 2 * i), e] - x[r, e]))
 
 
-@compiled
+@inlined
 def cart_drift(agents: int, row: int, damping: float, x: FloatArray, out: FloatArray, low: int, high: int) -> None:
     """`DoubleIntegrator.drift`."""
     for i in range(agents):
@@ -200,7 +200,7 @@ def cart_drift(agents: int, row: int, damping: float, x: FloatArray, out: FloatA
                 out[r + 2, at] = -damping * x[r + 2, at]
 
 
-@compiled
+@inlined
 def vessel_drift(agents: int, row: int, p: FloatArray, x: FloatArray, out: FloatArray, low: int, high: int) -> None:
     """`SurfaceVessel.drift`; p has mass, linear and quadratic drag, three numbers each."""
     m1, m2, m3 = p[0], p[1], p[2]
@@ -218,7 +218,7 @@ def vessel_drift(agents: int, row: int, p: FloatArray, x: FloatArray, out: Float
             out[r + 5, at] = ((m1 - m2) * surge * sway - (p[5] + p[8] * abs(yaw)) * yaw) / m3
 
 
-@compiled
+@inlined
 def unicycle_input_map(
     agents: int, row: int, of_u: int, x: FloatArray, u: FloatArray, out: FloatArray, low: int, high: int
 ) -> None:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled, place
+from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import sin, tanh
 from khop_env.physics.agent_model import FloatArray, IndexArray
 
@@ -80,7 +80,7 @@ def disturb(terms: Any, t: FloatArray, x: FloatArray, drawn: FloatArray, out: Fl
             add_coupling(x, first, terms.positions, part, amplitude, out, low, high)
 
 
-@compiled
+@inlined
 def add_sines(
     t: FloatArray,
     drawn: FloatArray,
@@ -120,7 +120,7 @@ def add_sines(
             out[index[c], b] += amplitude[c] * (total[c] / components)
 
 
-@compiled
+@inlined
 def add_gusts(
     t: FloatArray,
     drawn: FloatArray,
@@ -164,7 +164,7 @@ def add_gusts(
             out[index[c], b] += amplitude[c] * drawn[b, pulses * channels + first + c] * angle[c] * angle[c]
 
 
-@compiled
+@inlined
 def add_coupling(
     x: FloatArray,
     gain: float,

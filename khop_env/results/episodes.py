@@ -130,7 +130,8 @@ class EpisodeRecorder:
         known = np.zeros((4, pairs, env.num_envs))
         if observers.by_messages:
             information = observers.information(state)
-            summarize(*information, state.t, env.settings.control_period, known.reshape(-1, env.num_envs))
+            out = known.reshape(-1, env.num_envs)
+            summarize(*information, state.t, out, env.settings.control_period, 0, env.num_envs)
             known[AGE] = information.age
         else:
             up = links_up(simulator.design, observers, state)

@@ -7,24 +7,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from khop_env import catalog
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
-from khop_env.scenarios.convoy import convoy
-from khop_env.scenarios.corridor import corridor
-from khop_env.scenarios.crossing import crossing
-from khop_env.scenarios.mixed_fleet import mixed_fleet
-from khop_env.scenarios.paper import paper
-from khop_env.scenarios.random_geometric import random_geometric
 from khop_env.scenarios.scenario import Scenario
-from khop_env.scenarios.swap import swap
 
 ScenarioFactory = Callable[..., Scenario]
 """A function that makes a scenario; the parameters of a family are int, float, bool or str, with defaults."""
 
 SCENARIOS: dict[str, ScenarioFactory] = {
-    factory.__name__: factory for factory in (paper, convoy, mixed_fleet, random_geometric, swap, crossing, corridor)
+    name: load_object(f"khop_env.scenarios.{name}:{name}") for name in catalog.SCENARIOS
 }
-"""Every scenario of the library: the module `khop_env/scenarios/<name>.py` and its function of the same name."""
+"""Every scenario of the library."""
 
 _TRUTH = {"true": True, "false": False}
 
@@ -32,18 +26,6 @@ _TRUTH = {"true": True, "false": False}
 def scenarios() -> tuple[str, ...]:
     """The names of all scenarios."""
     return tuple(SCENARIOS)
-
-
-def describe() -> list[dict[str, Any]]:
-    """Name, one line, and parameters with their defaults of every scenario."""
-    return [
-        {
-            "name": name,
-            "description": (inspect.getdoc(factory) or "").partition("\n")[0],
-            "parameters": {key: each.default for key, each in inspect.signature(factory).parameters.items()},
-        }
-        for name, factory in SCENARIOS.items()
-    ]
 
 
 def scenario(name_or_path: str | Path, **parameters: Any) -> Scenario:

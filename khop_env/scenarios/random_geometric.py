@@ -7,6 +7,7 @@ import math
 import networkx as nx
 import numpy as np
 
+from khop_env.collection import collection_paused
 from khop_env.observers import Exponential
 from khop_env.physics import SingleIntegrator, Sinusoid, hop_distances, random_geometric_graph
 from khop_env.scenarios.scenario import MOST_AGENTS, LawChoice, Scenario
@@ -16,6 +17,7 @@ GAIN = 2.0
 RATE = 5.0  # 1/s, the paper's
 
 
+@collection_paused()
 def random_geometric(agents: int = 100, k: int = 2, seed: int = 0, rate: float = RATE) -> Scenario:
     """Single integrators on a random geometric graph, each to agree with neighbours and with a k-hop target.
 

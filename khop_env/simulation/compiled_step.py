@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled, numba, place
+from khop_env.compiled import compiled, inlined, numba, place
 from khop_env.observers import Extremes, FloatArray, IntArray, Observers, Proximal
 from khop_env.observers.disagreement import largest_ratios
 from khop_env.observers.performance import exponentials
@@ -57,13 +57,11 @@ class Values(NamedTuple):
 
 
 class System(NamedTuple):
-    """The equations of a step; fields that are tuples are those of the named tuples that they are called after.
+    """The equations of a step, by plain tuples with the fields of the named tuples that they are called after.
 
     Attributes:
         runs: all agents, of `physics.right_hand_sides.Runs`.
         estimates: the estimates whose observers know the drift, likewise.
-        input_runs: (3, K) estimates with an input observer: first row, the same among the input estimates, number.
-        all_drifts: whether `estimates` are all estimates.
         terms: of the disturbance, `physics.waveforms.TermArrays`.
         edges: of the law, `EdgeArrays`.
         states: the pairs of the state observers, `PairArrays`.
@@ -72,12 +70,13 @@ class System(NamedTuple):
         omega: those of the input observers.
         state_sums: (pairs,) [M_i^-1 1]_a of the state observers.
         input_sums: likewise of the input observers.
+        input_runs: (3 K,) K runs of estimates with an input observer: first rows, the same among the input estimates,
+            numbers of rows.
+        sizes: dimension of positions, and whether `estimates` are all estimates.
     """
 
     runs: Any
     estimates: Any
-    input_runs: IntArray
-    all_drifts: bool
     terms: Any
     edges: Any
     states: Any
@@ -86,6 +85,115 @@ class System(NamedTuple):
     omega: Any
     state_sums: FloatArray
     input_sums: FloatArray
+    input_runs: IntArray
+    sizes: IntArray
+
+
+def packed(system: System) -> tuple[IntArray, FloatArray]:
+    """All arrays of a system in two, of integers and of floats, since every argument of a compiled call takes time.
+
+    The integers begin with tables of where each array of integers, and then each of floats, begins and the last ends.
+    """
+    arrays = [np.ravel(each) for part in system for each in (part if isinstance(part, tuple) else (part,))]
+    integers = [each for each in arrays if each.dtype.kind == "i"]
+    floats = [each for each in arrays if each.dtype.kind == "f"]
+    assert (len(integers), len(floats)) == (_INTEGERS, _FLOATS)
+    starts = _INTEGERS + _FLOATS + 2 + np.cumsum([0, *map(len, integers)])
+    float_starts = np.cumsum([0, *map(len, floats)])
+    return np.concatenate([starts, float_starts, *integers]).astype(np.int64), np.concatenate(floats)
+
+
+_INTEGERS, _FLOATS = 49, 18
+
+
+@inlined
+def integers_at(integers: IntArray, q: int) -> IntArray:
+    """Array q of the integers of `packed`."""
+    return integers[integers[q] : integers[q + 1]]
+
+
+@inlined
+def floats_at(integers: IntArray, floats: FloatArray, q: int) -> FloatArray:
+    """Array q of the floats."""
+    return floats[integers[_INTEGERS + 1 + q] : integers[_INTEGERS + 2 + q]]
+
+
+@inlined
+def pairs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
+    """The fields of `PairArrays`, whose first array of integers is q and of floats r."""
+    return (
+        integers_at(n, q),
+        integers_at(n, q + 1),
+        integers_at(n, q + 2),
+        integers_at(n, q + 3),
+        integers_at(n, q + 4),
+        integers_at(n, q + 5),
+        floats_at(n, f, r),
+        floats_at(n, f, r + 1),
+        integers_at(n, q + 6),
+        integers_at(n, q + 7),
+        integers_at(n, q + 8),
+        integers_at(n, q + 9),
+    )
+
+
+@inlined
+def runs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
+    """The fields of `Runs`, likewise."""
+    return (
+        integers_at(n, q),
+        integers_at(n, q + 1),
+        integers_at(n, q + 2),
+        integers_at(n, q + 3),
+        integers_at(n, q + 4),
+        integers_at(n, q + 5),
+        integers_at(n, q + 6),
+        floats_at(n, f, r),
+    )
+
+
+@inlined
+def unpacked(n: IntArray, f: FloatArray) -> Any:
+    """The `System` that was `packed`."""
+    sizes = integers_at(n, 48)
+    dim = sizes[0]
+    positions, own, other = integers_at(n, 19), integers_at(n, 21), integers_at(n, 22)
+    terms = (
+        integers_at(n, 14),
+        integers_at(n, 15),
+        floats_at(n, f, 2),
+        floats_at(n, f, 3),
+        integers_at(n, 16),
+        integers_at(n, 17),
+        integers_at(n, 18),
+        floats_at(n, f, 4),
+        positions.reshape(positions.size // dim, dim),
+    )
+    position = integers_at(n, 26)
+    edges = (
+        integers_at(n, 20),
+        own.reshape(own.size // dim, dim),
+        other.reshape(other.size // dim, dim),
+        integers_at(n, 23),
+        integers_at(n, 24),
+        integers_at(n, 25),
+        position.reshape(position.size // dim, dim),
+        floats_at(n, f, 5),
+    )
+    return System(
+        runs_at(n, f, 0, 0),
+        runs_at(n, f, 7, 1),
+        terms,
+        edges,
+        pairs_at(n, f, 27, 6),
+        pairs_at(n, f, 37, 8),
+        (floats_at(n, f, 10), floats_at(n, f, 11), floats_at(n, f, 12)),
+        (floats_at(n, f, 13), floats_at(n, f, 14), floats_at(n, f, 15)),
+        floats_at(n, f, 16),
+        floats_at(n, f, 17),
+        integers_at(n, 47),
+        sizes,
+    )
 
 
 class Work(NamedTuple):
@@ -131,10 +239,11 @@ class CompiledStep:
         self._plant, self._observers, self._state = plant, observers, state
         self._ranges = plant.threads.ranges(batch)
         states, inputs, edges = design.states, design.inputs, plant.edges
-        self._system = tuple(
+        runs, input_runs, all_drifts = observers.prediction.compiled_runs()
+        self._system = packed(
             System(
                 plant.runs,
-                *observers.prediction.compiled_runs(),
+                runs,
                 plant.terms,
                 tuple(edges),
                 tuple(states.layout.packed),
@@ -143,6 +252,8 @@ class CompiledStep:
                 inputs.rho.coefficients,
                 states.layout.inverse_row_sums,
                 inputs.layout.inverse_row_sums,
+                input_runs,
+                np.array([fleet.position_dim, all_drifts], np.int64),
             )
         )
         self._work = Work(
@@ -164,7 +275,7 @@ class CompiledStep:
             SolveError: if a number isn't finite; the state is undefined then.
         """
         observers, state, work = self._observers, self._state, self._work
-        common = (self._system, self._plant.edge_law(), *observers.scheme(dt), *self._arrays, tuple(extremes))
+        common = (*self._system, self._plant.edge_law(), *observers.scheme(dt), *self._arrays, tuple(extremes))
 
         def part(range_: Range) -> tuple[int, int, int, int]:
             return step(*common, *range_)
@@ -197,7 +308,8 @@ def compiled_step(
 
 @compiled
 def step(
-    system: Any,
+    integers: IntArray,
+    floats: FloatArray,
     law: Any,
     nodes: FloatArray,
     explicit: FloatArray,
@@ -213,8 +325,9 @@ def step(
     """One step in the environments low to high - 1.
 
     Args:
-        system: the fields of `System`.
-        law: those of `EdgeLaw`; HELD for inputs that are held.
+        integers: of the `packed` `System`.
+        floats: likewise.
+        law: the fields of `EdgeLaw`; HELD for inputs that are held.
         nodes: (stages,) times of the stages after the beginning, in s.
         explicit: (stages, stages) weights of the rates, in s.
         implicit: (stages, stages) of the corrections, in s.
@@ -229,115 +342,92 @@ def step(
     Returns:
         What failed, if anything (_STATE, _STATES or _INPUTS), and then as `solve`.
     """
-    evaluations = 0
-    for first in range(low, high, BLOCK):
-        failure, count, env, target = advance_block(
-            system, law, nodes, explicit, implicit, now, before, drawn, work, first, min(first + BLOCK, high)
-        )
-        evaluations += count
-        if failure > 0:
-            return failure, evaluations, env, target
-        raise_block(system, now, work, extremes, first, min(first + BLOCK, high))
-    return 0, evaluations, -1, -1
-
-
-@compiled
-def advance_block(
-    system: Any,
-    law: Any,
-    nodes: FloatArray,
-    explicit: FloatArray,
-    implicit: FloatArray,
-    now: Any,
-    before: Any,
-    drawn: FloatArray,
-    work: Any,
-    low: int,
-    high: int,
-) -> tuple[int, int, int, int]:
-    """`step` for a block of environments, without the running maxima."""
-    system, now, before, work = System(*system), Values(*now), Values(*before), Work(*work)
-    keep(now, before, low, high)
-    batch, evaluations, observed = (low, high), 0, system.inputs[0].size
-    for s in range(nodes.size):
-        predict(system, now, work.predicted[s], low, high)
-        if not advance_plant(
-            system.runs,
-            system.terms,
-            drawn,
-            s,
-            nodes[s],
-            explicit[s],
-            before.t,
-            before.x,
-            now.t,
-            now.x,
-            now.g,
-            work.rates,
-            work.w,
-            low,
-            high,
-        ):
-            return _STATE, evaluations, -1, -1
-        combine(before.estimate, explicit[s], s + 1, work.predicted, now.estimate, low, high)
-        combine(now.estimate, implicit[s], s, work.slopes, now.estimate, low, high)
-        exponentials(now.t, system.rho[0], system.rho[1], system.rho[2], work.rho, low, high)
-        count, env, target = solve(
-            system.states,
-            implicit[s, s],
-            now.estimate,
-            now.x,
-            work.rho,
-            now.eps,
-            now.estimate,
-            work.slopes[s],
-            batch,
-            (0, system.states[0].size),
-        )
-        evaluations += count
-        if env >= 0:
-            return _STATES, evaluations, env, target
-        if law[0] != HELD:
-            command_inputs(
-                law,
-                system.edges,
+    system, now, before, work, extremes = (
+        unpacked(integers, floats),
+        Values(*now),
+        Values(*before),
+        Work(*work),
+        Extremes(*extremes),
+    )
+    observed, evaluations = system.inputs[0].size, 0
+    for begin in range(low, high, BLOCK):
+        end = min(begin + BLOCK, high)
+        keep(now, before, begin, end)
+        for s in range(nodes.size):
+            predict(system, now, work.predicted[s], begin, end)
+            if not advance_plant(
                 system.runs,
+                system.terms,
+                drawn,
+                s,
+                nodes[s],
+                explicit[s],
+                before.t,
+                before.x,
+                now.t,
                 now.x,
-                now.estimate,
-                now.u,
-                work.terms,
-                work.velocity,
-                work.drift,
-                low,
-                high,
-            )
-        input_maps(system.runs, now.x, now.u, now.g, low, high)
-        if observed:
-            if s:
-                combine(before.input_estimate, implicit[s], s, work.input_slopes, now.input_estimate, low, high)
-            exponentials(now.t, system.omega[0], system.omega[1], system.omega[2], work.omega, low, high)
-            count, env, target = solve(
-                system.inputs,
-                implicit[s, s],
-                now.input_estimate,
                 now.g,
-                work.omega,
-                now.nu,
-                now.input_estimate,
-                work.input_slopes[s],
-                batch,
-                (0, observed),
-            )
-            evaluations += count
-            if env >= 0:
-                return _INPUTS, evaluations, env, target
+                work.rates,
+                work.w,
+                begin,
+                end,
+            ):
+                return _STATE, evaluations, -1, -1
+            combine(before.estimate, explicit[s], s + 1, work.predicted, now.estimate, begin, end)
+            combine(now.estimate, implicit[s], s, work.slopes, now.estimate, begin, end)
+            law_due = law[0] != HELD
+            # the state observers' solve, the law between them, the input observers' solve: one call for both solves,
+            # which is what takes longest to compile
+            for kind in range(2 if observed else 1):
+                if kind == 0:
+                    pairs, estimate, source, widths = system.states, now.estimate, now.x, work.rho
+                    warm, slopes, funnels = now.eps, work.slopes, system.rho
+                else:
+                    if s:
+                        combine(
+                            before.input_estimate, implicit[s], s, work.input_slopes, now.input_estimate, begin, end
+                        )
+                    pairs, estimate, source, widths = system.inputs, now.input_estimate, now.g, work.omega
+                    warm, slopes, funnels = now.nu, work.input_slopes, system.omega
+                exponentials(now.t, funnels[0], funnels[1], funnels[2], widths, begin, end)
+                count, env, target = solve(
+                    pairs,
+                    implicit[s, s],
+                    estimate,
+                    source,
+                    widths,
+                    warm,
+                    estimate,
+                    slopes[s],
+                    (begin, end),
+                    (0, pairs[0].size),
+                )
+                evaluations += count
+                if env >= 0:
+                    return (_INPUTS if kind else _STATES), evaluations, env, target
+                if kind == 0:
+                    if law_due:
+                        command_inputs(
+                            law,
+                            system.edges,
+                            system.runs,
+                            now.x,
+                            now.estimate,
+                            now.u,
+                            work.terms,
+                            work.velocity,
+                            work.drift,
+                            begin,
+                            end,
+                        )
+                    input_maps(system.runs, now.x, now.u, now.g, begin, end)
+        raise_block(system, now, work, extremes, begin, end)
     return 0, evaluations, -1, -1
 
 
-@compiled
+@inlined
 def keep(now: Any, before: Any, low: int, high: int) -> None:
     """Copy `Values` of a block."""
-    now, before = Values(*now), Values(*before)
     for e in range(low, high):
         before.t[e] = now.t[e]
     copy_block(now.x, before.x, low, high)
@@ -349,7 +439,7 @@ def keep(now: Any, before: Any, low: int, high: int) -> None:
     copy_block(now.nu, before.nu, low, high)
 
 
-@compiled
+@inlined
 def copy_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
     """Copy the columns low to high - 1."""
     for row in range(values.shape[0]):
@@ -357,26 +447,25 @@ def copy_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None
             out[row, place(low + e)] = values[row, place(low + e)]
 
 
-@compiled
+@inlined
 def predict(system: Any, now: Any, out: FloatArray, low: int, high: int) -> None:
     """`Prediction.rate`: f(x_hat) + g_hat."""
-    system, now = System(*system), Values(*now)
-    if not system.all_drifts:
+    if not system.sizes[1]:
         for row in range(out.shape[0]):
             for e in range(high - low):
                 out[row, place(low + e)] = 0.0
     drifts(system.estimates, now.estimate, out, low, high)
-    for run in range(system.input_runs.shape[1]):
-        to, source = system.input_runs[0, run], system.input_runs[1, run]
-        for q in range(system.input_runs[2, run]):
+    count = system.input_runs.size // 3
+    for run in range(count):
+        to, source = system.input_runs[run], system.input_runs[count + run]
+        for q in range(system.input_runs[2 * count + run]):
             for e in range(high - low):
                 out[to + q, place(low + e)] += now.input_estimate[source + q, place(low + e)]
 
 
-@compiled
+@inlined
 def raise_block(system: Any, now: Any, work: Any, extremes: Any, low: int, high: int) -> None:
     """`FunnelObservers.raise_extremes`."""
-    system, now, work, extremes = System(*system), Values(*now), Work(*work), Extremes(*extremes)
     largest_ratios(
         system.states,
         now.estimate,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled, place
+from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import tanh
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import Fleet
@@ -145,7 +145,7 @@ def command_inputs(
                 u[row, place(low + e)] = most if value > most else value
 
 
-@compiled
+@inlined
 def finish_mean(law: Any, edges: Any, x: FloatArray, velocity: FloatArray, low: int, high: int) -> None:
     """From sums over edges to the velocities (N, d, B) of the laws that average."""
     for i in range(velocity.shape[0]):
@@ -168,7 +168,7 @@ def finish_mean(law: Any, edges: Any, x: FloatArray, velocity: FloatArray, low: 
                     velocity[i, c, at] *= factor
 
 
-@compiled
+@inlined
 def subtract_drift(runs: Any, x: FloatArray, drift: FloatArray, velocity: FloatArray, low: int, high: int) -> None:
     """Subtract the drift from the velocities of agents whose input is a velocity; the others come without one."""
     drifts(runs, x, drift, low, high)

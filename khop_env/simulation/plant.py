@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.compiled import compiled, place
+from khop_env.compiled import compiled, inlined, place
 from khop_env.elementary import all_finite, weighted_sum
 from khop_env.observers import FloatArray, PlantState, SolveError
 from khop_env.physics import Fleet, read_only
@@ -254,7 +254,7 @@ def advance_plant(
     return total == 0.0
 
 
-@compiled
+@inlined
 def combine(
     base: FloatArray, weights: FloatArray, count: int, terms: FloatArray, out: FloatArray, low: int, high: int
 ) -> None:

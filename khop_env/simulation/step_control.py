@@ -135,7 +135,7 @@ class StepControl:
         self._planned, self._last_error = (
             0.0,
             1.0,
-        )  # the next step's size; 0 before the first and after a jump: the shortest
+        )  # the next size; 0 for the shortest, at the start and after a jump
 
     def warm_up(self) -> None:
         """Compile what a step needs beside `Simulator.warm_up`."""

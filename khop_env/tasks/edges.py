@@ -6,16 +6,17 @@ import abc
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypedDict
+from typing import Any, Literal, NamedTuple, TypedDict
 
 import numpy as np
 
-from khop_env.compiled import compiled
+from khop_env.compiled import compiled, place
 from khop_env.observers import FloatArray, IntArray
 from khop_env.tasks.base import Column, Outcome, Signature, Task, World
 
 Reward = Literal["agent", "team"]
 NUMBER = (int, float, np.integer, np.floating)
+_TILE = 32  # environments whose rewards are written together
 
 
 class EdgeArguments(TypedDict, total=False):
@@ -84,14 +85,19 @@ class EdgeTask(Task):
         super().bind(world)
         self.edges, self.displacement = self.relations(world)
         fleet, members = world.fleet, list(self.acting(world))
-        number = {agent: place for place, agent in enumerate(members)}
+        # of each edge a number that grows with it, for `_desired`
+        code = self.edges[:, 0] * len(fleet) + self.edges[:, 1]
+        self._by_number = np.argsort(code, kind="stable")
+        self._codes = code[self._by_number]
+        self._reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
+        number = {agent: order for order, agent in enumerate(members)}
         counted = np.array([i in number for i in self.edges[:, 0].tolist()], bool)
         edges, position = self.edges[counted], fleet.position_index
         agent = np.array([number[i] for i in edges[:, 0].tolist()], np.int64)
         input_owner = np.full(fleet.m, -1, np.int64)
-        for place, i in enumerate(members):
-            input_owner[fleet.input_slice(i)] = place
-        self._arrays = EdgeArrays(
+        for i, owner in number.items():
+            input_owner[fleet.input_slice(i)] = owner
+        arrays = EdgeArrays(
             agent,
             np.ascontiguousarray(position[edges[:, 0]]),
             np.ascontiguousarray(position[edges[:, 1]]),
@@ -99,14 +105,15 @@ class EdgeTask(Task):
             1.0 / np.bincount(agent, minlength=len(members))[agent],
             input_owner,
         )
+        self._arrays: Any = tuple(arrays)  # Numba recognises the types of a plain tuple more quickly
+        self._work = arrays.own.size + fleet.m + len(members)
         self._period = world.control_period
         self._squares = np.zeros((len(members), world.num_envs))
         self._efforts = np.zeros((len(members), world.num_envs))
 
     def slot_columns(self, world: World, agent: int, other: int) -> Sequence[Column]:
         """The desired displacement along the edge; zeros without an edge."""
-        reach = max(world.limit, float(np.abs(self.displacement).max(initial=0.0)))
-        desired = self._desired(agent, other)
+        reach, desired = self._reach, self._desired(world, agent, other)
         names = axis_names(world.fleet.position_dim)
         model = world.fleet.models[other]
         units = [model.states[name] for name in model.position]
@@ -119,8 +126,9 @@ class EdgeTask(Task):
         """See the class; "task_error" is the root mean square error along the agent's own edges in m."""
         shape = world.num_envs, len(self._squares)
         reward, error = np.empty(shape), np.empty(shape)
-        period, effort = world.control_period, float(self.effort)
-        evaluate_edges(self._arrays, world.x, world.inputs, period, effort, self._squares, self._efforts, reward, error)
+        period, effort = float(world.control_period), float(self.effort)
+        arrays = self._arrays, world.x, world.inputs, self._squares, self._efforts, reward, error
+        world.each(lambda low, high: evaluate_edges(*arrays, period, effort, low, high), self._work)
         if self.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
         terminated = np.zeros(world.num_envs, bool)
@@ -139,9 +147,12 @@ class EdgeTask(Task):
         edges = [f"{ids[i]} to {ids[j]} by {d} m" for (i, j), d in zip(self.edges.tolist(), places, strict=True)]
         return {**super().signature(world), "task edges": tuple(edges)}
 
-    def _desired(self, agent: int, other: int) -> list[float]:
-        found = np.flatnonzero((self.edges[:, 0] == agent) & (self.edges[:, 1] == other))
-        return self.displacement[found[0]].tolist() if found.size else [0.0] * self.displacement.shape[1]
+    def _desired(self, world: World, agent: int, other: int) -> list[float]:
+        number = agent * len(world.fleet) + other
+        place = int(self._codes.searchsorted(number))
+        if place < len(self._codes) and self._codes[place] == number:
+            return self.displacement[self._by_number[place]].tolist()
+        return [0.0] * self.displacement.shape[1]
 
 
 def require_positive(name: str, value: object) -> None:
@@ -172,43 +183,53 @@ def ring(count: int, dim: int) -> FloatArray:
 
 @compiled
 def evaluate_edges(
-    edges: EdgeArrays,
+    edges: Any,
     x: FloatArray,
     inputs: FloatArray,
-    period: float,
-    effort: float,
     squares: FloatArray,
     efforts: FloatArray,
     reward: FloatArray,
     error: FloatArray,
+    period: float,
+    effort: float,
+    low: int,
+    high: int,
 ) -> None:
-    """Write every agent's reward, and its root mean square error along its task edges.
+    """Write every agent's reward, and its root mean square error along its task edges, in environments low to high.
 
     Args:
-        edges: of the acting agents.
+        edges: of the acting agents, the fields of `EdgeArrays` as a plain tuple.
         x: (n, B) states.
         inputs: (m, B) inputs as fractions of their limits.
-        period: control period in s.
-        effort: weight of the squared inputs in m^2.
         squares: (N, B) scratch.
         efforts: (N, B) scratch.
         reward: (B, N) overwritten with -period * (mean square error + effort * |u|^2).
         error: (B, N) overwritten with the root mean square error in m.
+        period: control period in s.
+        effort: weight of the squared inputs in m^2.
+        low: first environment.
+        high: one past the last.
     """
-    squares[:] = 0.0
-    efforts[:] = 0.0
+    edges = EdgeArrays(*edges)
+    for i in range(squares.shape[0]):
+        for b in range(high - low):
+            squares[i, place(low + b)] = 0.0
+            efforts[i, place(low + b)] = 0.0
     for edge in range(edges.agent.size):
         agent, weight = edges.agent[edge], edges.weight[edge]
         for c in range(edges.own.shape[1]):
-            for env in range(x.shape[1]):
+            for b in range(high - low):
+                env = place(low + b)
                 miss = x[edges.other[edge, c], env] - x[edges.own[edge, c], env] - edges.displacement[edge, c]
                 squares[agent, env] += weight * miss * miss
     for column in range(edges.input_owner.size):
         owner = edges.input_owner[column]
         if owner >= 0:
-            for env in range(inputs.shape[1]):
+            for b in range(high - low):
+                env = place(low + b)
                 efforts[owner, env] += inputs[column, env] * inputs[column, env]
-    for env in range(reward.shape[0]):
+    for first in range(low, high, _TILE):
         for i in range(reward.shape[1]):
-            reward[env, i] = -period * (squares[i, env] + effort * efforts[i, env])
-            error[env, i] = np.sqrt(squares[i, env])
+            for env in range(first, min(first + _TILE, high)):
+                reward[env, i] = -period * (squares[i, env] + effort * efforts[i, env])
+                error[env, i] = np.sqrt(squares[i, env])

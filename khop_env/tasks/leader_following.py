@@ -12,12 +12,14 @@ import numpy as np
 from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import AgentModel, Fleet, did_you_mean, hop_distances, hops_from_targets, velocity_to_input
+from khop_env.physics.velocity import VELOCITY_CONTROLLERS
 from khop_env.tasks.base import Signature, World
 from khop_env.tasks.edges import EdgeTask, require_positive, ring
 
 SINES = 3  # per axis
 BAND = (1.5, 2.5)  # rad/s: range of the routes' frequencies
 POSITION_GAIN = 1.0  # 1/s: pulls a leader back to its route, so that drift and disturbance don't carry it away
+_DIRECT = VELOCITY_CONTROLLERS["integrator"]  # the library's own: the input is the velocity
 
 
 @dataclass(eq=False, kw_only=True)
@@ -75,6 +77,12 @@ class LeaderFollowing(EdgeTask):
         self._amplitude = np.array(self.speeds) * math.sqrt(2.0 / (SINES * shape[1]))
         self._positions = fleet.position_index[list(chosen)]
         self._velocity = np.zeros((world.num_envs, *shape))
+        self._rows, self._limit = np.full(shape, -1), np.zeros(shape)
+        for number, i in enumerate(chosen):
+            if VELOCITY_CONTROLLERS.get(fleet.models[i].type) is _DIRECT:
+                own = fleet.input_slice(i)
+                self._rows[number], self._limit[number] = range(own.start, own.stop), fleet.input_limit[own]
+        self._others = [(number, i) for number, i in enumerate(chosen) if self._rows[number, 0] < 0]
 
     def relations(self, world: World) -> tuple[IntArray, FloatArray]:
         """An edge from each follower to its leader, with its place on the ring around it."""
@@ -98,13 +106,17 @@ class LeaderFollowing(EdgeTask):
 
     def drive(self, world: World, u: FloatArray) -> None:
         """The leaders' inputs along their routes."""
-        states, inputs, velocity, memory = world.x.T, u.T, self._velocity, self.memory
+        fleet, states, inputs, velocity, memory = world.fleet, world.x.T, u.T, self._velocity, self.memory
         routes = memory["frequency"], memory["phase"], memory["start"], self._amplitude
-        _commanded(world.t, world.x, self._positions, *routes, velocity)
-        fleet = world.fleet
-        for number, i in enumerate(self.leader_indices):
-            own = states[:, fleet.state_slice(i)]
-            inputs[:, fleet.input_slice(i)] = velocity_to_input(fleet.models[i], own, velocity[:, number])
+        arrays = world.t, world.x, self._positions, *routes, self._rows, self._limit, velocity, u
+
+        def write(low: int, high: int) -> None:
+            drive_leaders(*arrays, low, high)
+            for number, i in self._others:
+                own, wanted = states[low:high, fleet.state_slice(i)], velocity[low:high, number]
+                inputs[low:high, fleet.input_slice(i)] = velocity_to_input(fleet.models[i], own, wanted)
+
+        world.each(write, velocity[0].size * 20 * (1 + SINES))
 
     def signature(self, world: World) -> Signature:
         """Leaders with their speeds, edges and displacements."""
@@ -115,7 +127,7 @@ class LeaderFollowing(EdgeTask):
 
 
 @compiled
-def _commanded(
+def drive_leaders(
     t: FloatArray,
     x: FloatArray,
     positions: IntArray,
@@ -123,10 +135,31 @@ def _commanded(
     phase: FloatArray,
     start: FloatArray,
     amplitude: FloatArray,
+    row: IntArray,
+    limit: FloatArray,
     velocity: FloatArray,
+    u: FloatArray,
+    low: int,
+    high: int,
 ) -> None:
-    """Velocities (B, leaders, axes) along the routes, and back to them."""
-    for env in range(velocity.shape[0]):
+    """Velocities along the routes, and back to them, of L leaders with d axes.
+
+    Args:
+        t: (B,) time since reset in s.
+        x: (n, B) states.
+        positions: (L, d) rows of the leaders' positions in the states.
+        frequency: (B, L, d, sines) in rad/s.
+        phase: (B, L, d, sines).
+        start: (B, L, d) in m, where the routes begin.
+        amplitude: (L,) of each sine in m/s.
+        row: (L, d) of the inputs that are these velocities; -1 where the inputs are something else.
+        limit: (L, d) of these inputs.
+        velocity: (B, L, d) overwritten, in m/s.
+        u: (m, B) overwritten in these rows with the velocities within the limits.
+        low: first environment.
+        high: one past the last.
+    """
+    for env in range(low, high):
         for leader in range(velocity.shape[1]):
             for axis in range(velocity.shape[2]):
                 speed, moved = 0.0, 0.0
@@ -136,7 +169,10 @@ def _commanded(
                     speed += amplitude[leader] * math.sin(angle)
                     moved += amplitude[leader] * (math.cos(first) - math.cos(angle)) / rate
                 place = start[env, leader, axis] + moved - x[positions[leader, axis], env]
-                velocity[env, leader, axis] = speed + POSITION_GAIN * place
+                wanted = speed + POSITION_GAIN * place
+                velocity[env, leader, axis] = wanted
+                if row[leader, axis] >= 0:
+                    u[row[leader, axis], env] = min(max(wanted, -limit[leader, axis]), limit[leader, axis])
 
 
 def _speed(model: AgentModel) -> float:

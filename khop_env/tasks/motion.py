@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from khop_env.compiled import compiled
-from khop_env.observers import FloatArray, IntArray
+from khop_env.compiled import compiled, place
+from khop_env.observers import FloatArray
 
 
 @compiled
@@ -36,7 +36,13 @@ def segment_to_segment(px: float, py: float, qx: float, qy: float, ax: float, ay
 
 @compiled
 def lower_distances(
-    before: FloatArray, after: FloatArray, obstacles: FloatArray, nearest: FloatArray, clearance: FloatArray
+    before: FloatArray,
+    after: FloatArray,
+    obstacles: FloatArray,
+    nearest: FloatArray,
+    clearance: FloatArray,
+    low: int,
+    high: int,
 ) -> None:
     """Lower the smallest distances by those of one step, in which all move straight, at constant speed and at once.
 
@@ -48,11 +54,14 @@ def lower_distances(
         obstacles: (M, 5) ends and radius of each, in the plane.
         nearest: (N, B) distance to the nearest other agent, lowered in place.
         clearance: (N, B) distance to the nearest obstacle, lowered in place; negative inside of one.
+        low: first environment.
+        high: one past the last.
     """
-    agents, dim, batch = before.shape
+    agents, dim, _ = before.shape
     for i in range(agents):
         for j in range(i):
-            for env in range(batch):
+            for b in range(high - low):
+                env = place(low + b)
                 square, along, length = 0.0, 0.0, 0.0
                 for c in range(dim):
                     gap = before[i, c, env] - before[j, c, env]
@@ -71,7 +80,7 @@ def lower_distances(
                 nearest[i, env] = min(nearest[i, env], distance)
                 nearest[j, env] = min(nearest[j, env], distance)
         for m in range(obstacles.shape[0]):
-            for env in range(batch):
+            for env in range(low, high):
                 distance = segment_to_segment(
                     before[i, 0, env],
                     before[i, 1, env],
@@ -83,11 +92,3 @@ def lower_distances(
                     obstacles[m, 3],
                 )
                 clearance[i, env] = min(clearance[i, env], distance - obstacles[m, 4])
-
-
-@compiled
-def add_squares(owner: IntArray, inputs: FloatArray, out: FloatArray) -> None:
-    """Add to `out` (N, B) the squares of the inputs (m, B) that belong to each agent, by `owner` (m,)."""
-    for column in range(owner.size):
-        for env in range(inputs.shape[1]):
-            out[owner[column], env] += inputs[column, env] * inputs[column, env]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, TypedDict
+from typing import Any, ClassVar, TypedDict
 
 import numpy as np
 
@@ -14,12 +14,14 @@ from khop_env.observers import FloatArray, IntArray
 from khop_env.simulation import Arena
 from khop_env.tasks.base import Column, MapCanvas, Outcome, Signature, Task, World
 from khop_env.tasks.edges import NUMBER, Reward, axis_names, require_positive
-from khop_env.tasks.motion import add_squares, lower_distances
+from khop_env.tasks.goals import Memory, evaluate_goals, follow_motion, observe_goals
+from khop_env.tasks.motion import lower_distances
 
 START = np.array([0.8, 0.5])  # of an arrow in the legend
 RING = np.column_stack([np.cos(np.linspace(0.0, 2.0 * np.pi, 49)), np.sin(np.linspace(0.0, 2.0 * np.pi, 49))])
 DISC, COLLIDED, OBSTACLE, ARROW, MARKED = "#8899aa", "#cc3311", "#999999", "#ee7733", "#aa3377"
 GOAL, TO_GOAL = "#228833", "#99ccaa"
+INFOS = ("task_error", "cost", "arrived", "min_distance", "obstacle_distance")
 
 
 class NavigationArguments(TypedDict, total=False):
@@ -98,6 +100,8 @@ class Navigation(Task):
             "reached": np.zeros((len(fleet), world.num_envs)),  # 1 if it had arrived before this control period
         }
         self._input_owner = np.repeat(np.arange(len(fleet)), [model.m for model in fleet.models])
+        self._numbers = len(fleet) * (len(fleet) * fleet.position_dim + 20 * len(self._obstacles))  # in `moved`
+        self._after, self._effort = np.zeros(shape), np.zeros((len(fleet), world.num_envs))
 
     def columns(self, world: World, agent: int) -> Sequence[Column]:
         """Goal and nearest points of all obstacles, relative to the agent, the nearest first; the agents' radius."""
@@ -110,26 +114,8 @@ class Navigation(Task):
 
     def observe(self, world: World, out: FloatArray) -> None:
         """Fill these columns."""
-        positions = world.positions()
-        agents, dim, batch = positions.shape
-        rows = out.reshape(agents, -1, batch)
-        rows[:, :dim] = self.memory["goal"] - positions
-        if len(self._obstacles):
-            gaps = self._to_obstacles(positions)
-            order = np.argsort(np.hypot(gaps[:, 0], gaps[:, 1]), axis=1, kind="stable")[:, None]
-            nearest = np.take_along_axis(gaps, order, axis=2).swapaxes(1, 2)
-            rows[:, dim:] = nearest.reshape(agents, -1, batch)
-
-    def _to_obstacles(self, positions: FloatArray) -> FloatArray:
-        """(N, 2, M, B) from each agent to each obstacle's nearest point; towards its surface from inside, too."""
-        ends = self._obstacles[:, :4].reshape(-1, 2, 2).transpose(1, 2, 0)[:, None, :, :, None]  # (2, 1, 2, M, 1)
-        along, own = ends[1] - ends[0], positions[:, :, None]
-        length = (along * along).sum(axis=1, keepdims=True)
-        share = ((own - ends[0]) * along).sum(axis=1, keepdims=True) / np.where(length > 0.0, length, 1.0)
-        gap = ends[0] + np.clip(share, 0.0, 1.0) * along - own
-        distance = np.sqrt((gap * gap).sum(axis=1, keepdims=True))
-        radius = self._obstacles[:, 4][:, None]
-        return gap * (1.0 - radius / np.where(distance > 0.0, distance, np.inf))
+        arrays = world.fleet.position_index, world.x, self.memory["goal"], self._obstacles, out
+        world.each(lambda low, high: observe_goals(*arrays, low, high), len(out) * 5)
 
     def reset(self, world: World, env_ids: IntArray, rngs: Sequence[np.random.Generator]) -> None:
         """Draw the goals."""
@@ -144,52 +130,38 @@ class Navigation(Task):
         memory["reached"][:, env_ids] = 0.0
         here = np.ascontiguousarray(positions[..., env_ids])
         nearest, clearance = (np.full((len(here), len(env_ids)), world.limit) for _ in range(2))
-        lower_distances(here, here, self._obstacles, nearest, clearance)
+        lower_distances(here, here, self._obstacles, nearest, clearance, 0, len(env_ids))
         for name, values in (("before", here), ("place", here), ("nearest", nearest), ("clearance", clearance)):
             memory[name][..., env_ids] = values
 
     def moved(self, world: World, number: int) -> None:
         """Lower the smallest distances of the control period."""
-        memory, positions = self.memory, world.positions()
-        if number == 0:
-            np.maximum(memory["reached"], self._arrived(memory["place"]), out=memory["reached"])
-            memory["before"][...] = memory["place"]
-            memory["nearest"][...] = memory["clearance"][...] = world.limit
-        place = memory["place"]
-        lower_distances(place, positions, self._obstacles, memory["nearest"], memory["clearance"])
-        place[...] = positions
+        memory, index, x = self._arrays(), world.fleet.position_index, world.x
+        first, radius, limit = number == 0, float(self.goal_radius), float(world.limit)
+        arrays = memory, index, x, self._obstacles, self._after
+        world.each(lambda low, high: follow_motion(*arrays, first, radius, limit, low, high), self._numbers)
 
-    def _arrived(self, positions: FloatArray) -> FloatArray:
-        return (self._distance(positions) <= self.goal_radius).astype(float)
-
-    def _distance(self, positions: FloatArray) -> FloatArray:
-        gap = self.memory["goal"] - positions
-        return np.sqrt((gap * gap).sum(axis=1))
+    def _arrays(self) -> Any:
+        """The memory for compiled loops."""
+        return tuple([self.memory[name] for name in Memory._fields])
 
     def evaluate(self, world: World) -> Outcome:
         """See the class; "task_error" is the distance to the goal."""
-        memory, radius = self.memory, self.arena.radius
-        distance = self._distance(world.positions())
-        arrived = (distance <= self.goal_radius).astype(float)
-        cost = ((memory["nearest"] < 2.0 * radius) | (memory["clearance"] < radius)).astype(float)
-        effort = np.zeros(distance.shape)
-        add_squares(self._input_owner, world.inputs, effort)
-        reward = self._distance(memory["before"]) - distance - world.control_period * self.effort * effort
-        reward += self.bonus * arrived * (1.0 - memory["reached"]) - self.penalty * cost
-        reward = reward.T.copy()  # in this order a mean has the same bits for any number of environments
+        shape = world.num_envs, len(self._effort)
+        reward, terminated = np.empty(shape), np.empty(world.num_envs, bool)
+        infos = {name: np.empty(shape) for name in INFOS}
+        memory, index, x = self._arrays(), world.fleet.position_index, world.x
+        arrays = memory, index, x, world.inputs, self._input_owner, self._effort
+        results = reward, terminated, tuple(infos.values())
+        weights = float(world.control_period * self.effort), float(self.bonus), float(self.penalty)
+        sizes = float(self.goal_radius), float(self.arena.radius)
+        ends = self.end_at_collision
+        world.each(
+            lambda low, high: evaluate_goals(*arrays, *results, weights, sizes, ends, low, high), 10 * len(self._effort)
+        )
         if self.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)
-        terminated = np.asarray(arrived.all(axis=0))
-        if self.end_at_collision:
-            terminated |= cost.any(axis=0)
-        infos = {
-            "task_error": distance,
-            "cost": cost,
-            "arrived": arrived,
-            "min_distance": memory["nearest"],
-            "obstacle_distance": memory["clearance"],
-        }
-        return Outcome(reward, terminated, {name: each.T.copy() for name, each in infos.items()})
+        return Outcome(reward, terminated, infos)
 
     def signature(self, world: World) -> Signature:
         """Name, agents' size, goals and obstacles."""

@@ -13,6 +13,7 @@ from benchmarks import benchmark as module
 from benchmarks import environments, study
 from benchmarks.benchmark import benchmark
 from benchmarks.comparison import compare, left_out
+from benchmarks.growth import held_memory
 from benchmarks.report import Report
 from benchmarks.yardsticks import CompiledPaper
 from khop_env.observers import Explicit
@@ -57,6 +58,10 @@ def test_every_promised_figure_is_printed():
         "ratio_to_floor",
         "growth_time",
         "growth_memory",
+        "environment_growth_time",
+        "environment_growth_memory",
+        "wifi_growth_time",
+        "wifi_growth_memory",
         "training",
         "training_environment_share",
         "network_relay_ratio",
@@ -68,7 +73,10 @@ def test_every_promised_figure_is_printed():
     } <= set(rows)
     assert rows.pop("violations") == rows.pop("collisions_certified") == 0
     assert {f"filter_{place}_{how}" for place in ("apart", "crowd") for how in ("single", "batch")} <= set(rows)
+    threads = {"threads_paper", "threads_convoy", "threads_paper_wifi"}
+    assert threads | {f"{name}_plain" for name in threads} <= set(rows)
     assert PARTS | RATES | {"environment_control_period", "environment_substeps"} <= set(rows)
+    assert {f"{kind}_making_1000" for kind in ("environment", "wifi")} <= set(rows)
     assert (rows["environment_control_period"], rows["environment_substeps"]) == (0.05, 1)
     assert all(np.isfinite(value) and value > 0 for value in rows.values())
     assert rows["proximal_error"] < 2e-3
@@ -162,7 +170,7 @@ def test_a_peer_that_fails_costs_its_ratio_only(tmp_path):
 @pytest.fixture
 def quick_parts(monkeypatch):
     """Parts that need the core only, with a row each."""
-    for index, name in enumerate(("_against_explicit", "_growth")):
+    for index, name in enumerate(("_against_explicit", "growth_rows")):
         monkeypatch.setattr(module, name, lambda add, *rest, index=index: add(f"row {index}", 1.0))
     monkeypatch.setattr(module, "_ratio_to_floor", lambda quick: 2.0)
     monkeypatch.setattr(module, "environment_rows", lambda report, *rest: report.add("row 2", np.inf))
@@ -248,3 +256,11 @@ def test_a_training_of_the_study_whose_mark_is_damaged_has_not_finished(tmp_path
     if text is not None:
         (tmp_path / study.DONE).write_text(text)
     assert study.seconds_of(tmp_path) == {"12": 12.0, "12.5\n": 12.5}.get(text)
+
+
+def test_memory_counts_arrays_and_objects_once_and_leaves_out_what_is_shared():
+    shared, own = np.zeros(10_000), np.zeros(20_000)
+    subject = {"own": own, "view": own[5:], "again": [own], "shared": shared[1:]}
+    held = held_memory([subject], besides=[shared])
+    assert own.nbytes < held < own.nbytes + 3000
+    assert own.nbytes + shared.nbytes < held_memory([subject], besides=[])

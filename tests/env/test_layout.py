@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from khop_env import consensus_v0
 from khop_env.tasks import EdgeTask
 from tests.env.playing import EVERY, batched, built, parallel, play
 from tests.strategies import definition_of_m
@@ -328,3 +329,33 @@ def test_a_component_keeps_its_own_bounds_in_a_column_that_agents_of_several_typ
     assert max(counts) > 0
     if limit == 0.25:
         assert {"surge", "vx"} & seen  # clipped, where other types have a cosine in the same column
+
+
+def test_agents_with_equal_columns_share_them_in_memory():
+    env = consensus_v0.batched_env("random_geometric:agents=60")
+    layouts = {}
+    for layout in env.layouts:
+        layouts.setdefault(layout.names, []).append(layout)
+    assert len(layouts) < len(env.layouts) / 3
+    for alike in layouts.values():
+        for other in alike:
+            assert other.fields is alike[0].fields
+            assert other.names is alike[0].names
+            assert other.low is alike[0].low
+    assert [layout.agent for layout in env.layouts] == list(env.agents)
+    with pytest.raises(ValueError, match="read-only"):
+        env.layouts[0].low[0] = 1.0
+
+
+@pytest.mark.parametrize("network", [None, "wifi"])
+def test_hundreds_of_agents(network):
+    env = consensus_v0.parallel_env("random_geometric:agents=300", network=network)
+    before, _ = env.reset(seed=0)
+    for _ in range(3):
+        after, rewards, _, _, infos = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+    assert len(rewards) == 300
+    assert all(env.observation_space(agent).contains(values) for agent, values in after.items())
+    assert infos["integrator_0"]["max_error_to_bound"] <= 1.0
+    valid = [env.layout(agent).index("slot0.valid") for agent in env.agents]
+    assert all(after[agent][column] == 1.0 for agent, column in zip(env.agents, valid, strict=True))
+    assert all((before[agent] != after[agent]).any() for agent in env.agents)

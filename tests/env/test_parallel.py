@@ -2,6 +2,7 @@
 
 import math
 import re
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -195,6 +196,32 @@ def test_unknown_agents_have_no_spaces():
             method("drifter_0")
 
 
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda actions: dict(reversed(actions.items())),
+        lambda actions: MappingProxyType(actions),
+        lambda actions: {agent: action.tolist() for agent, action in actions.items()},
+        lambda actions: {agent: action.astype(object) for agent, action in actions.items()},
+        lambda actions: {agent: action.astype(np.int8) for agent, action in actions.items()},
+        lambda actions: {agent: action.astype(str) for agent, action in actions.items()},
+    ],
+)
+def test_actions_in_any_form_are_the_same(form):
+    """In another order, in another mapping, and as other numbers; -1, 0 and 1 are exact in all of them."""
+    seen = []
+    for change in (dict, form):
+        env = parallel("consensus_v0")
+        env.reset(seed=3)
+        rng = np.random.default_rng(0)
+        for _ in range(3):
+            actions = {agent: rng.integers(-1, 2, 2).astype(np.float32) for agent in env.agents}
+            result = env.step(change(actions))
+        seen.append(result)
+    assert same(*seen)
+    assert env.batched.world.inputs.any()
+
+
 WRONG_SETTINGS = {
     "observe": (
         "estimated",
@@ -210,7 +237,7 @@ WRONG_SETTINGS = {
     "limit": (float("inf"), "limit must be a positive, finite number of at most 1e30; got inf"),
     "effort": (-0.1, "effort must be finite and not negative; got -0.1"),
     "order": (3, "exists at order 1 and 2; got order=3"),
-    "threads": (0, "threads must be"),
+    "threads": (0, "threads must be a positive integer or 'auto'; got 0"),
     "actuator": ("lagg", r"no actuator 'lagg'; did you mean 'lag'.*Lag\(time_constant=0.2\)"),
     "render_mode": ("rgb", "render_mode must be None, 'human' or 'rgb_array'; got 'rgb'$"),
     "scenario": ("convoi", "no scenario 'convoi'; did you mean 'convoy'"),

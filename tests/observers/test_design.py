@@ -164,6 +164,7 @@ PLAIN, NO_INPUT = TargetObservers(), TargetObservers(input_observer=False)
         (INTEGRATORS, ONE, {0: ONE}, None, "theta has no bound for agent 'integrator_1'"),
         (INTEGRATORS, dict.fromkeys(range(4), (ONE,)), ONE, None, "delta of agent 'integrator_0': expected .* of 2"),
         (INTEGRATORS, dict.fromkeys(range(4), 0.1), ONE, None, "delta of agent 'integrator_0': expected .*got 0.1"),
+        (INTEGRATORS, {**dict.fromkeys(range(3), ONE), 3: 0.1}, ONE, None, "delta of agent 'integrator_3': .*got 0.1"),
         (INTEGRATORS, ONE, (ONE, 3.0), None, "theta of agent 'integrator_0': expected a performance function"),
     ],
 )

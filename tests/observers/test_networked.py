@@ -235,7 +235,18 @@ def test_rounds_of_one_instant_end_at_the_proximal_step(system, seed, tau):
         held = np.where(from_source[:, None], source[places * from_source], y[places * ~from_source])
         following = predictor.copy()
         solve_alone(
-            layout.packed, np.array(start), np.array(offset), tau, held, rho, np.ones(batch, bool), eps, following, e
+            layout.packed,
+            np.array(start),
+            np.array(offset),
+            tau,
+            held,
+            rho,
+            np.ones(batch, bool),
+            eps,
+            following,
+            e,
+            0,
+            batch,
         )
         if np.abs(following - y).max() < 1e-13:
             break
@@ -256,7 +267,18 @@ def test_the_scalar_solve_is_exact_from_any_warm_start(seed, scale, stiffness):
         y, e = predictor.copy(), np.zeros((size, batch))
         pairs = layout.states.layout.pairs
         solve_alone(
-            packed, np.arange(pairs + 1), 2 * np.arange(pairs), tau, held, rho, np.ones(batch, bool), warm, y, e
+            packed,
+            np.arange(pairs + 1),
+            2 * np.arange(pairs),
+            tau,
+            held,
+            rho,
+            np.ones(batch, bool),
+            warm,
+            y,
+            e,
+            0,
+            batch,
         )
         np.testing.assert_allclose(e, np.tanh(warm / 2.0), atol=1e-11)  # of eps, which is returned in its place
         for side in (-1.0, 1.0):  # the equation changes its sign within 1e-9 of the solution
@@ -349,14 +371,14 @@ def test_a_limit_is_the_same_after_a_restore():
 def test_an_error_that_is_not_a_number_is_reported():
     for error in ([np.nan, 0.1], [0.1, np.nan]):
         largest = np.zeros(1)
-        largest_share(np.array([0, 0]), np.array(error)[:, None], np.zeros((1, 1)), np.ones((2, 1)), largest)
+        largest_share(np.array([0, 0]), np.array(error)[:, None], np.zeros((1, 1)), np.ones((2, 1)), largest, 0, 1)
         assert np.isnan(largest[0])
 
 
 def test_a_proposal_that_is_not_a_number_gives_the_prediction():
     simulator = chain([SingleIntegrator()] * 3, "wifi", LastHeard())
     simulator.state.memory["held.state"][...] = np.nan
-    simulator.observers._report(simulator.state)
+    simulator.observers._clip(simulator.state.memory, (0, 1))
     np.testing.assert_array_equal(simulator.estimates.T, simulator.state.memory["center"])
 
 

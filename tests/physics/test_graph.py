@@ -205,3 +205,22 @@ def test_geometric_graph_has_about_the_mean_degree_and_follows_its_generator() -
 def test_geometric_graph_refuses_nonsense(agents: int, mean_degree: float) -> None:
     with pytest.raises(ValueError, match="at least one agent and a positive mean degree"):
         random_geometric_graph(agents, mean_degree, np.random.default_rng(0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(agents=st.integers(1, 80), mean_degree=st.floats(1e-9, 1e9), seed=st.integers(0, 10**6))
+def test_geometric_graphs_have_their_edges_in_order_of_all_pairs(agents: int, mean_degree: float, seed: int) -> None:
+    """Row by row, then along the tree as Prim's algorithm finds it: task graphs are drawn from this order."""
+    graph, points = random_geometric_graph(agents, mean_degree, np.random.default_rng(seed))
+    away2 = ((points[:, None] - points[None]) ** 2).sum(axis=-1)
+    expected = nx.empty_graph(agents)
+    expected.add_edges_from(
+        (i, j) for i in range(agents) for j in range(i + 1, agents) if away2[i, j] < mean_degree / np.pi
+    )
+    inside = [0]
+    while len(inside) < agents:
+        outside = [j for j in range(agents) if j not in inside]
+        parent, new = min(((i, j) for j in outside for i in inside), key=lambda edge: away2[edge])
+        expected.add_edge(parent, new)
+        inside.append(new)
+    assert [list(graph.adj[i]) for i in range(agents)] == [list(expected.adj[i]) for i in range(agents)]

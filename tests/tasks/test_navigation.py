@@ -30,7 +30,7 @@ def test_distances_along_motion_are_those_of_many_samples():
     obstacles = np.hstack([rng.uniform(-1.0, 1.0, (3, 4)), rng.uniform(0.0, 0.2, (3, 1))])
     obstacles[0, 2:4] = obstacles[0, :2]  # a disc
     nearest, clearance = np.full((4, 50), np.inf), np.full((4, 50), np.inf)
-    lower_distances(before, after, obstacles, nearest, clearance)
+    lower_distances(before, after, obstacles, nearest, clearance, 0, nearest.shape[1])
     share = np.linspace(0.0, 1.0, 2001)[:, None, None, None]
     places = before + share * (after - before)  # (S, N, 2, B)
     gaps = np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
@@ -53,12 +53,12 @@ def test_two_that_pass_within_a_step_collide():
     """At neither end of the step are they near each other; one that waits until the other has passed isn't hit."""
     before = np.array([[[-1.0], [0.0]], [[1.0], [0.1]]])
     nearest, clearance = np.full((2, 1), np.inf), np.full((2, 1), np.inf)
-    lower_distances(before, before * [[-1.0], [1.0]], np.zeros((0, 5)), nearest, clearance)
+    lower_distances(before, before * [[-1.0], [1.0]], np.zeros((0, 5)), nearest, clearance, 0, nearest.shape[1])
     np.testing.assert_allclose(nearest, 0.1)
     # crossing paths, at different times: the segments cross, the agents don't meet
     before, after = np.array([[[-1.0], [0.0]], [[0.0], [3.0]]]), np.array([[[1.0], [0.0]], [[0.0], [-1.0]]])
     nearest[...] = np.inf
-    lower_distances(before, after, np.zeros((0, 5)), nearest, clearance)
+    lower_distances(before, after, np.zeros((0, 5)), nearest, clearance, 0, nearest.shape[1])
     assert nearest[0, 0] == pytest.approx(math.sqrt(0.2))
     assert segment_to_segment(-1.0, 0.0, 1.0, 0.0, 0.0, 3.0, 0.0, -1.0) == 0.0
 

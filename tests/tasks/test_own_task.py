@@ -96,6 +96,24 @@ def test_a_wrong_outcome_is_named(parts, message):
         env.reset(seed=0)
 
 
+def test_a_later_outcome_is_checked_as_well():
+    """Every step's, not the first one's alone."""
+    task = KeepApart()
+    env = make_batched(task, "paper", num_envs=2)
+    env.reset(seed=0)
+    env.step(np.zeros((2, 8, 2)))
+    right = env.task.evaluate(env.world)
+    for wrong, message in (
+        (right._replace(reward=right.reward[0]), r"reward must be an array of shape \(2, 8\).*got shape \(8,\)"),
+        (right._replace(terminated=right.terminated.astype(int)), "terminated must be an array of 2 bools"),
+        (right._replace(infos={"cost": right.reward}), "infos must have 'task_error'"),
+        (right._replace(infos={**right.infos, "extra": [0.0]}), "the info extra must be an array"),
+    ):
+        env.task.evaluate = lambda world, wrong=wrong: wrong
+        with pytest.raises(ValueError, match=message):
+            env.step(np.zeros((2, 8, 2)))
+
+
 def test_columns_need_a_writer_and_names_of_their_own():
     class Silent(KeepApart):
         observe = khop_env.Task.observe

@@ -9,7 +9,8 @@ import pytest
 from khop_env import leader_following_v0
 from khop_env.observers import Exponential, ObserverDesign
 from khop_env.physics import Fleet, SingleIntegrator
-from khop_env.tasks import Formation, World
+from khop_env.registry import make_batched
+from khop_env.tasks import EdgeTask, Formation, World
 from tests.env.playing import ALONG_EDGES, EVERY_ALONG_EDGES, SCENARIOS, batched, built, parallel, play, random_actions
 
 every = pytest.mark.parametrize(("environment", "name"), EVERY_ALONG_EDGES)
@@ -274,3 +275,25 @@ def test_leaders_and_followers_are_the_users_to_choose():
     assert one.batched.task.leader_indices == (0, 6)
     assert one.batched.task.speeds == (1.5, 1.5)
     assert len(parallel("leader_following_v0", "convoy", leaders=4).batched.task.leader_indices) == 4
+
+
+class AnyOrder(EdgeTask):
+    """Edges in the order in which somebody wrote them down."""
+
+    def relations(self, world):
+        return np.array([[5, 6], [0, 2], [5, 4], [0, 1]]), np.arange(8.0).reshape(4, 2)
+
+
+def test_slots_have_the_displacement_of_their_own_edge_in_whatever_order_edges_are():
+    env = make_batched(AnyOrder(), "paper")
+    expected = {(5, 6): [0.0, 1.0], (0, 2): [2.0, 3.0], (5, 4): [4.0, 5.0], (0, 1): [6.0, 7.0]}
+    observations, _ = env.reset(seed=0)
+    seen = 0
+    for i, layout in enumerate(env.layouts):
+        for number, slot in enumerate(layout.slots):
+            columns = layout.columns(f"slot{number}.displacement")
+            wanted = expected.get((i, slot.agent), [0.0, 0.0])
+            assert observations[0, i, columns].tolist() == wanted
+            assert slot.task_edge == ((i, slot.agent) in expected)
+            seen += (i, slot.agent) in expected
+    assert seen == len(expected)
