@@ -172,9 +172,14 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
     ]
     networked = "network" in summary
     how = summary["estimator"] if networked else f"{summary['integrator']}, order {summary['order']}"
+    if "tolerance" not in summary:
+        steps = f"steps of {summary['dt']:g} s"
+    else:
+        rejected = summary["rejected_steps"]
+        steps = f"steps of tolerance {summary['tolerance']:g}, {rejected} of them taken back"
     print_text(
         f"{summary['scenario']}: {summary['agents']} agents, {summary['pairs']} pairs of observer and target, "
-        f"{summary['duration']:.6g} s in steps of {summary['dt']:g} s ({how}), {summary['controller']} on {observed}, "
+        f"{summary['duration']:.6g} s in {steps} ({how}), {summary['controller']} on {observed}, "
         f"seed {summary['seed']}"
     )
     if networked:

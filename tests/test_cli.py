@@ -219,6 +219,23 @@ class TestRun:
         found = only_json(khop("run", "paper", "--integrator", "explicit", "--duration", "0.002", "--json"))
         assert (found["integrator"], found["order"], found["dt"], found["steps"]) == ("explicit", 1, 1e-5, 200)
 
+    @pytest.mark.usefixtures("without_figures")
+    def test_steps_of_controlled_size(self, folder):
+        found = only_json(khop("run", "paper", "--tolerance", "1e-2", "--duration", "1", "--json"))
+        assert (found["dt"], found["tolerance"], found["samples"]) == (None, 1e-2, 101)
+        assert found["steps"] < 60
+        assert found["funnel_kept"] is True
+        assert found["configuration"]["tolerance"] == 1e-2
+        for options, expected in (
+            (["--dt", "0.01"], "--dt: the size of steps follows from --tolerance"),
+            (["--order", "1"], "--order 1: --tolerance estimates the error of the proximal step of order 2"),
+            (["--integrator", "explicit"], "--integrator explicit: --tolerance estimates"),
+            (["--network", "wifi"], "--tolerance: over a network estimates follow from rounds of messages"),
+            (["--controller", "random"], "--tolerance: a policy acts in its environment"),
+        ):
+            assert expected in khop("run", "paper", "--tolerance", "1e-2", *options, status=2).stderr
+        assert "from 1e-09 to 1; got 3.0" in khop("run", "paper", "--tolerance", "3", status=2).stderr
+
     def test_leaving_the_funnel_loses_nothing(self, folder):
         arguments = ["run", "paper", "--integrator", "explicit", "--dt", "1e-3", "--out", "lost"]
         result = khop(*arguments, status=1)

@@ -33,6 +33,7 @@ class OrderOption(enum.StrEnum):
 
     ONE = "1"
     TWO = "2"
+    THREE = "3"
 
 
 @dataclass
@@ -45,8 +46,9 @@ class Episode:
         observers: how they are stepped.
         controller: name of the law or policy.
         duration: in s.
-        dt: in s.
+        dt: in s; None for steps of controlled size.
         content: digest of what the controller is made of.
+        tolerance: of steps of controlled size.
     """
 
     simulator: Any
@@ -54,8 +56,9 @@ class Episode:
     observers: Observers
     controller: str
     duration: float
-    dt: float
+    dt: float | None
     content: str
+    tolerance: float | None = None
 
 
 def resolved(name: str, elsewhere: str | None) -> tuple[Task | type[Task] | None, Scenario]:
@@ -112,15 +115,24 @@ def continuous(
     from khop_env.observers import Explicit, Proximal
     from khop_env.scenarios.scenario import number_of_steps
     from khop_env.simulation.plant import parts_of_step
+    from khop_env.simulation.step_control import require_tolerance
 
-    for option in ("--order", "--integrator"):
+    for option in ("--order", "--integrator", "--tolerance"):
         if over is not None and steps[option] is not None:
             raise ValueError(f"{option}: over a network estimates follow from rounds of messages; leave it out")
-    order, explicit = steps["--order"], steps["--integrator"] is not None
-    if explicit and order is OrderOption.TWO:
-        raise ValueError("--order 2: the explicit integrator is forward Euler, of order 1; leave --order out")
+    order, explicit, tolerance = steps["--order"], steps["--integrator"] is not None, steps["--tolerance"]
+    if tolerance is not None:
+        require_tolerance(tolerance)
+        if steps["--dt"] is not None:
+            raise ValueError("--dt: the size of steps follows from --tolerance; give one of the two")
+        if explicit or order is OrderOption.ONE:
+            wrong = "--order 1" if order is OrderOption.ONE else "--integrator explicit"
+            raise ValueError(f"{wrong}: --tolerance is for the proximal step of order 2 or 3; leave it out")
+        order = order or OrderOption.THREE
+    if explicit and order not in (None, OrderOption.ONE):
+        raise ValueError(f"--order {order}: the explicit integrator is forward Euler, of order 1; leave --order out")
     duration = scenario.duration if duration is None else duration
-    dt = steps["--dt"] if steps["--dt"] is not None else EXPLICIT_STEP if explicit else scenario.dt
+    dt: float = steps["--dt"] if steps["--dt"] is not None else EXPLICIT_STEP if explicit else scenario.dt
     number_of_steps(duration, dt)  # refuses too many of them before anything is built
     law = law_of(scenario, controller)
     made = make_law(law)
@@ -132,7 +144,8 @@ def continuous(
     simulator.reset(seed)
     for warning in scenario.warnings:
         say(f"khop: {warning}")
-    return Episode(simulator, None, simulator.observers, law.name, duration, dt, digest(law.name, law.parameters))
+    content, step = digest(law.name, law.parameters), dt if tolerance is None else None
+    return Episode(simulator, None, simulator.observers, law.name, duration, step, content, tolerance)
 
 
 def played_episode(
@@ -191,6 +204,8 @@ def configuration_of(scenario: Scenario, episode: Episode, observe: str, seed: i
         "scenario_content": digest(scenario, sources(scenario.models)),
         "controller_content": episode.content,
     }
+    if episode.tolerance is not None:
+        found["tolerance"] = episode.tolerance
     if isinstance(episode.observers, Networked):
         estimator = episode.observers.estimator
         found |= {"network": plain(episode.observers.network), "estimator": estimator.name}

@@ -71,6 +71,13 @@ def run(
         float | None,
         typer.Option(help=f"Step in seconds; by default the scenario's, or {EXPLICIT_STEP:g} for explicit."),
     ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="Steps as long as their estimated errors allow, instead of --dt: at most this much of 1 + |value| in "
+            "every state and estimate, for example 1e-3."
+        ),
+    ] = None,
     integrator: Annotated[
         IntegratorOption, typer.Option(help="Integrator of the observers.")
     ] = IntegratorOption.PROXIMAL,
@@ -107,14 +114,19 @@ def run(
     run in it is left alone.
     """
     from khop_env.observers import Networked
-    from khop_env.results import RunFileError, record, summarize, write_run
+    from khop_env.results import RunFileError, record, record_controlled, summarize, write_run
 
     with mistakes(scenario or name), waiting(f"designing the observers of {name}"):
         task, chosen = resolved(name, scenario)
         if shield is not None:
             inside = controller or (None if task is None else task.default_policy) or chosen.law.name
             controller = shielded_name(inside, shield)
-        steps = {"--dt": dt, "--order": order, "--integrator": integrator if integrator != "proximal" else None}
+        steps = {
+            "--dt": dt,
+            "--tolerance": tolerance,
+            "--order": order,
+            "--integrator": integrator if integrator != "proximal" else None,
+        }
         if task is not None or is_policy(controller):
             for option, value in steps.items():
                 if value is not None:
@@ -142,15 +154,19 @@ def run(
         ]
         folder = choose_folder(Path("runs") / folder_name(*parts, f"seed{seed}"), out, configuration)
     with mistakes(scenario or name), Progress(f"simulating {chosen.name}") as progress:
-        recording = record(
-            episode.simulator,
-            episode.duration,
-            episode.dt,
-            task_error=None if played is None else played.task_error,
-            ended=None if played is None else played.ended,
-            drawing=None if played is None or video is None else played.drawing,
-            progress=progress,
-        )
+        if episode.tolerance is not None:
+            recording = record_controlled(episode.simulator, episode.duration, episode.tolerance, progress=progress)
+        else:
+            assert episode.dt is not None
+            recording = record(
+                episode.simulator,
+                episode.duration,
+                episode.dt,
+                task_error=None if played is None else played.task_error,
+                ended=None if played is None else played.ended,
+                drawing=None if played is None or video is None else played.drawing,
+                progress=progress,
+            )
     summary = summarize(
         recording,
         chosen,
@@ -159,6 +175,7 @@ def run(
         observers=episode.observers,
         controller=episode.controller,
         observe=observe.value,
+        tolerance=episode.tolerance,
     )
     summary |= {"configuration": configuration, **({} if played is None else result_of(played, recording))}
     unwritten: RunFileError | None = None

@@ -298,7 +298,7 @@ class BatchedEnv:
             self.task.drive(self.world, physical)
             as_fractions(self._driven, physical, self._limit, inputs)
         self.simulator.hold(physical)
-        self.simulator.advance(self._dt, self._parts)
+        self.simulator.step_unchecked(self._dt, self._parts)
         self.task.moved(self.world, number)
 
     def _evaluate(self) -> Outcome:

@@ -9,18 +9,22 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.compiled import compiled
+from khop_env.compiled import compiled, inlined
 from khop_env.network.randomness import SCHEDULE_ROUND, round_key, uniform
 from khop_env.physics import FloatArray, IndexArray, Links
 
 BoolArray = NDArray[np.bool_]
 KeyArray = NDArray[np.uint64]
 
-_SLACK = 1e-9  # s: grid times are sums of steps, and a change at 1 s must not wait for the step after 0.9999999
+SLACK = 1e-9  # s: grid times are sums of steps, and a change at 1 s must not wait for the step after 0.9999999
 
 
 class Part(Protocol):
-    """A schedule bound to links."""
+    """A schedule bound to links.
+
+    One whose links change at known times may also have `next_change(key, t)`, as in `Activity`: steps of controlled
+    size then end there.
+    """
 
     def __call__(self, key: KeyArray, t: FloatArray, x: FloatArray, out: BoolArray) -> None:
         """Clear in `out` (L, B) the links that are down; arguments as in `Activity.up`."""
@@ -51,6 +55,19 @@ class Activity:
             part(key, t, x, out)
         return out
 
+    def next_change(self, key: KeyArray, t: FloatArray) -> FloatArray:
+        """(B,) the next times in s at which links may change, as far as time alone decides it; inf where none is known.
+
+        Args:
+            key: (B,) of each environment's randomness.
+            t: (B,) time since reset in s; changes that `up` already shows are past.
+        """
+        out = np.full(len(t), np.inf)
+        for part in self._parts:
+            if (known := getattr(part, "next_change", None)) is not None:
+                np.minimum(out, known(key, t), out=out)
+        return out
+
 
 class Masked:
     """A fixed choice of links, `mask` (L,)."""
@@ -71,10 +88,17 @@ class Switched:
 
     def __call__(self, key: KeyArray, t: FloatArray, x: FloatArray, out: BoolArray) -> None:
         """See `Part`."""
-        now = t + _SLACK
+        now = t + SLACK
         if self._period:
             now %= self._period
         _clear_others(np.searchsorted(self._starts, now, "right") - 1, self._masks, out)
+
+    def next_change(self, key: KeyArray, t: FloatArray) -> FloatArray:
+        """See `Activity.next_change`."""
+        now = t + SLACK
+        place = now % self._period if self._period else now
+        starts = np.append(self._starts, self._period or np.inf)
+        return now + (starts[np.searchsorted(self._starts, place, "right")] - place)
 
 
 class Drawn:
@@ -163,6 +187,12 @@ class Off:
             key, t, self._first, self._start, self._duration, self._agent, self._link, self._agents, *self._ends, out
         )
 
+    def next_change(self, key: KeyArray, t: FloatArray) -> FloatArray:
+        """See `Activity.next_change`."""
+        out = np.empty(len(t))
+        _next_of_outage(key, t, self._first, self._start, self._duration, out)
+        return out
+
 
 def _first(links: Links, number: int) -> int:
     """First random number of a schedule: one for each link and three more are its own."""
@@ -191,6 +221,24 @@ def _clear_far(sender: IndexArray, receiver: IndexArray, radius: float, x: Float
             out[link, b] &= square <= radius * radius
 
 
+@inlined
+def _outage(
+    base: np.uint64, first: int, start: tuple[float, float], duration: tuple[float, float]
+) -> tuple[float, float]:
+    begin = start[0] + start[1] * uniform(base, first, 0)
+    return begin, begin + duration[0] + duration[1] * uniform(base, first + 1, 0)
+
+
+@compiled
+def _next_of_outage(
+    key: KeyArray, t: FloatArray, first: int, start: tuple[float, float], duration: tuple[float, float], out: FloatArray
+) -> None:
+    for b in range(t.size):
+        begin, end = _outage(round_key(key[b], SCHEDULE_ROUND), first, start, duration)
+        now = t[b] + SLACK
+        out[b] = begin if now < begin else end if now < end else math.inf
+
+
 @compiled
 def _clear_off(
     key: KeyArray,
@@ -207,9 +255,8 @@ def _clear_off(
 ) -> None:
     for b in range(out.shape[1]):
         base = round_key(key[b], SCHEDULE_ROUND)
-        begin = start[0] + start[1] * uniform(base, first, 0)
-        end = begin + duration[0] + duration[1] * uniform(base, first + 1, 0)
-        now = t[b] + _SLACK
+        begin, end = _outage(base, first, start, duration)
+        now = t[b] + SLACK
         if now < begin or now >= end:
             continue
         if link >= 0:

@@ -33,15 +33,20 @@ class Tableau:
 
 _GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
 _DELTA = 1.0 - 1.0 / (2.0 * _GAMMA)
-# ARS(1,1,1) and ARS(2,2,2): U. M. Ascher, S. J. Ruuth, R. J. Spiteri, Implicit-explicit Runge-Kutta methods for
-# time-dependent partial differential equations, 1997. Stiffly accurate: a step's result is its last stage, which is a
-# proximal step itself, so the funnel is kept at every grid point and in every stage.
+# ARS(1,1,1), ARS(2,2,2) and ARS(4,4,3): U. M. Ascher, S. J. Ruuth, R. J. Spiteri, Implicit-explicit Runge-Kutta methods
+# for time-dependent partial differential equations, 1997. Stiffly accurate: a step's result is its last stage, which is
+# a proximal step itself, so the funnel is kept at every grid point and in every stage.
 TABLEAUS = {
     1: Tableau(nodes=(1.0,), explicit=((1.0,),), implicit=((1.0,),)),
     2: Tableau(
         nodes=(_GAMMA, 1.0),
         explicit=((_GAMMA,), (_DELTA, 1.0 - _DELTA)),
         implicit=((_GAMMA,), (1.0 - _GAMMA, _GAMMA)),
+    ),
+    3: Tableau(
+        nodes=(1 / 2, 2 / 3, 1 / 2, 1.0),
+        explicit=((1 / 2,), (11 / 18, 1 / 18), (5 / 6, -5 / 6, 1 / 2), (1 / 4, 7 / 4, 3 / 4, -7 / 4)),
+        implicit=((1 / 2,), (1 / 6, 1 / 2), (-1 / 2, 1 / 2, 1 / 2), (3 / 2, -3 / 2, 1 / 2, 1 / 2)),
     ),
 }
 
@@ -69,7 +74,7 @@ class Proximal(FunnelObservers):
     Its memory adds "eps" (P, B) and "nu" (Q, B): the transformed disagreements, from which the next solve starts.
 
     Args:
-        order: 1 or 2.
+        order: 1, 2 or 3.
         threads: number of threads that share the environments (or targets, in a small batch); results don't depend
             on it.
 
@@ -87,7 +92,7 @@ class Proximal(FunnelObservers):
 
     def __init__(self, order: int = 2, threads: int = 1) -> None:
         if order not in TABLEAUS:
-            raise ValueError(f"the proximal step exists at order 1 and 2; got order={order!r}")
+            raise ValueError(f"the proximal step exists at order 1, 2 and 3; got order={order!r}")
         if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or not 1 <= threads <= MOST_THREADS:
             raise ValueError(f"threads must be an integer from 1 to {MOST_THREADS}; got {threads!r}")
         self.order, self.threads = order, threads

@@ -1,6 +1,7 @@
 """Results: recordings of runs, tidy tables, metrics, figures, films and design reports."""
 
 from khop_env.results.assumptions import Assumption, assumptions
+from khop_env.results.controlled import record_controlled
 from khop_env.results.curves import error_over_time, learning_curves, network_figure, set_iss_figure
 from khop_env.results.dataset import EpisodeDataset
 from khop_env.results.episodes import EpisodeRecorder
@@ -35,6 +36,7 @@ __all__ = [
     "network_report",
     "paper_figure",
     "record",
+    "record_controlled",
     "set_iss_figure",
     "states_table",
     "summarize",

@@ -50,10 +50,11 @@ def summarize(
     scenario: Scenario,
     *,
     seed: int,
-    dt: float,
+    dt: float | None,
     observers: Observers,
     controller: str,
     observe: Observe,
+    tolerance: float | None = None,
 ) -> dict[str, Any]:
     """Summary of a run.
 
@@ -64,6 +65,8 @@ def summarize(
 
     Where links come and go there is one key more: `cut_off`, the share of pairs and samples at which the target didn't
     reach its observer, so that there was no guarantee.
+
+    Steps of controlled size have two keys more: `tolerance`, and `rejected_steps`, how many were taken back.
 
     Over a network of messages the certified bounds are what is guaranteed, and the disagreements are those that the
     estimator's agents compute from what they hold, null where it has none. `funnel_kept` is about
@@ -76,10 +79,11 @@ def summarize(
         recording: recording of the run.
         scenario: scenario of the run.
         seed: seed of the initial state and the disturbance.
-        dt: step in s.
+        dt: step in s; None for steps of controlled size.
         observers: those of the simulator.
         controller: name of the feedback law.
         observe: information of the law on k-hop targets: estimates, true states, or none.
+        tolerance: of steps of controlled size.
     """
     extremes = recording.extremes
     state_ratios = [extremes.normalized[0], extremes.relative[0]]
@@ -120,6 +124,8 @@ def summarize(
             **{name: importlib.metadata.version(name) for name in ("numpy", "numba")},
         },
     }
+    if tolerance is not None:
+        found |= {"tolerance": tolerance, "rejected_steps": recording.rejected}
     if isinstance(states, MessageRecord):
         kept = ended and all(ratio < 1.0 + ROUNDING for ratio in errors)  # an error may reach its certified bound
         return found | _of_network(observers, recording.fleet, states, kept)

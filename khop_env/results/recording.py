@@ -26,7 +26,7 @@ Progress = Callable[[float], None]
 MOST_ROWS = 5_000_000
 """Limit on samples times estimates of a recording (40 MB per array); larger fleets are sampled less often."""
 
-_TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.07000000000000001
+TIME_DECIMALS = 12  # grid times are rounded to picoseconds: 0.07, not 0.07000000000000001
 
 
 class StoppedError(RuntimeError):
@@ -48,6 +48,7 @@ class Recording:
         inputs: samples of the input observers; P = 0 if there are none, and None under a network.
         extremes: largest ratios over all steps, also those between samples; arrays of shape (1,).
         steps: number of steps taken.
+        rejected: number of steps of controlled size that were taken back; None for steps of a given size.
         wall_time: seconds of stepping and sampling, without compilation.
         error: the exception that ended the episode early, or None; samples until then are kept.
         task_error: (T,) mean task error of the team; None without an environment's task.
@@ -65,6 +66,7 @@ class Recording:
     error: Failure | None = None
     task_error: FloatArray | None = None
     drawings: tuple[Drawing, ...] | None = None
+    rejected: int | None = None
 
     def __repr__(self) -> str:
         samples = f"{len(self.time)} samples of {self.steps} steps to t = {self.time[-1]:g} s"
@@ -119,30 +121,24 @@ def record(
         ValueError: if the simulator has several environments, or duration or step isn't positive and finite, or there
             would be too many steps.
     """
-    if simulator.num_envs != 1:
-        raise ValueError(f"expected a simulator of one environment; got num_envs={simulator.num_envs}")
     steps = number_of_steps(duration, dt)
-    if not 0.0 < samples_per_second < math.inf:
-        raise ValueError(f"samples_per_second must be positive and finite; got {samples_per_second!r}")
-    design = simulator.design
-    width = max(1, simulator.observers.layout.size, design.inputs.layout.size)
-    most_samples = max(2, MOST_ROWS // width)
+    most_samples = most_samples_of(simulator, samples_per_second)
     stride = max(1, math.ceil(1.0 / (dt * samples_per_second) - 1e-9), math.ceil(steps / (most_samples - 1)))
-    samples = _Samples(simulator, 1 + math.ceil(steps / stride), task_error, drawing)
+    samples = Samples(simulator, 1 + math.ceil(steps / stride), task_error, drawing)
     error: Failure | None = None
     with np.errstate(all="ignore"):  # NumPy's warnings name no agent; SolveError and the summary do
         simulator.warm_up()
         start = reported = clock.perf_counter()
-        samples.take()
+        samples.take(simulator)
         done = 0
         try:
             for k in range(1, steps + 1):
-                until = duration if k == steps else round(k * dt, _TIME_DECIMALS)
+                until = duration if k == steps else round(k * dt, TIME_DECIMALS)
                 simulator.step(until - float(simulator.t[0]))
                 done = k
                 over = ended is not None and ended()
                 if k % stride == 0 or k == steps or over:
-                    samples.take()
+                    samples.take(simulator)
                 if over:
                     break
                 if progress is not None and (now := clock.perf_counter()) - reported > 0.1:
@@ -151,15 +147,35 @@ def record(
         except (FunnelError, SolveError, StoppedError) as stopped:  # the state before the failed step is kept
             error = stopped
             if done % stride:
-                samples.take()
+                samples.take(simulator)
     wall_time = clock.perf_counter() - start
     if progress is not None and error is None:
         progress(1.0)
     return samples.recording(done, wall_time, error)
 
 
-class _Samples:
-    """Arrays for all samples of an episode."""
+def most_samples_of(simulator: Simulator, samples_per_second: float) -> int:
+    """The largest number of samples of a run.
+
+    Raises:
+        ValueError: for a simulator of several environments, or samples per second that aren't positive and finite.
+    """
+    if simulator.num_envs != 1:
+        raise ValueError(f"expected a simulator of one environment; got num_envs={simulator.num_envs}")
+    if not 0.0 < samples_per_second < math.inf:
+        raise ValueError(f"samples_per_second must be positive and finite; got {samples_per_second!r}")
+    return max(2, MOST_ROWS // max(1, simulator.observers.layout.size, simulator.design.inputs.layout.size))
+
+
+class Samples:
+    """Arrays for all samples of an episode.
+
+    Args:
+        simulator: of which, or of whose closed loop, samples are taken.
+        count: number of samples, at most.
+        task_error: as in `record`.
+        drawing: as in `record`.
+    """
 
     def __init__(
         self,
@@ -170,41 +186,49 @@ class _Samples:
     ) -> None:
         self._simulator, self._drawing = simulator, drawing
         self._drawings: list[Drawing] = []
-        self._sources: dict[str, Callable[[], FloatArray]] = {
-            "time": lambda: simulator.t,
-            "x": lambda: simulator.x[0],
-            "u": lambda: simulator.u[0],
-            "g": lambda: simulator.g[0],
-            "estimate": lambda: simulator.estimates[0],
+        self._sources: dict[str, Callable[[Simulator], FloatArray]] = {  # (B, columns), environment by environment
+            "time": lambda sim: sim.t[:, None],
+            "x": lambda sim: sim.x,
+            "u": lambda sim: sim.u,
+            "g": lambda sim: sim.g,
+            "estimate": lambda sim: sim.estimates,
         }
         observers = simulator.observers
         if observers.links_up(simulator.state) is not None:
-            self._sources["up"] = lambda: np.asarray(observers.links_up(simulator.state), float)[:, 0]
+            self._sources["up"] = lambda sim: np.asarray(sim.observers.links_up(sim.state), float).T
         if observers.by_messages:
             self._sources |= {
-                "bound": lambda: simulator.error_bounds().bound[:, 0],
-                "age": lambda: observers.information(simulator.state).age[:, 0],
-                "missed": lambda: missed_rounds(observers, simulator.state)[:, 0],
+                "bound": lambda sim: sim.error_bounds().bound.T,
+                "age": lambda sim: sim.observers.information(sim.state).age.T,
+                "missed": lambda sim: missed_rounds(sim.observers, sim.state).T,
             }
         else:
             self._sources |= {
-                "disagreement": lambda: simulator.disagreements()[0],
-                "input_estimate": lambda: simulator.input_estimates[0],
-                "input_disagreement": lambda: simulator.input_disagreements()[0],
+                "disagreement": lambda sim: sim.disagreements(),
+                "input_estimate": lambda sim: sim.input_estimates,
+                "input_disagreement": lambda sim: sim.input_disagreements(),
             }
         if task_error is not None:
-            self._sources["task_error"] = lambda: np.array([task_error()])
-        self._arrays = {name: np.empty((count, len(read()))) for name, read in self._sources.items()}
+            self._sources["task_error"] = lambda sim: np.array([[task_error()]])
+        self._arrays = {name: np.empty((count, read(simulator).shape[1])) for name, read in self._sources.items()}
         self._taken = 0
 
-    def take(self) -> None:
+    @property
+    def newest(self) -> float:
+        """Time of the newest sample."""
+        return float(self._arrays["time"][self._taken - 1, 0])
+
+    def take(self, simulator: Simulator, count: int = 1) -> None:
+        """Add a sample from each of a simulator's first environments."""
+        rows = slice(self._taken, self._taken + count)
         for name, read in self._sources.items():
-            self._arrays[name][self._taken] = read()
+            self._arrays[name][rows] = read(simulator)[:count]
         if self._drawing is not None:
             self._drawings.append(self._drawing())
-        self._taken += 1
+        self._taken += count
 
-    def recording(self, steps: int, wall_time: float, error: Failure | None) -> Recording:
+    def recording(self, steps: int, wall_time: float, error: Failure | None, rejected: int | None = None) -> Recording:
+        """The recording of the samples so far."""
         design = self._simulator.design
         kept = {name: values[: self._taken] for name, values in self._arrays.items()}
         time = kept["time"][:, 0]
@@ -244,4 +268,5 @@ class _Samples:
             error=error,
             task_error=kept["task_error"][:, 0] if "task_error" in kept else None,
             drawings=None if self._drawing is None else tuple(self._drawings),
+            rejected=rejected,
         )

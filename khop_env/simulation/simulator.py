@@ -14,31 +14,28 @@ from numpy.typing import ArrayLike
 from khop_env.brief import spread
 from khop_env.observers import (
     Assumptions,
-    Certified,
     Extremes,
     FloatArray,
     FunnelError,
-    Funnels,
     IntArray,
     ObserverDesign,
     Observers,
     Proximal,
     SolveError,
 )
-from khop_env.observers.disagreement import disagreement_by
-from khop_env.observers.funnel_observers import LinksNow, weights_at
-from khop_env.physics import read_only
 from khop_env.simulation.compiled_step import compiled_step
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
+from khop_env.simulation.readings import Readings
 from khop_env.simulation.state import SimulatorState
+from khop_env.simulation.step_control import StepControl, StepCount
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
 from khop_env.threads import Threads
 
 _WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
 
 
-class Simulator:
+class Simulator(Readings):
     """B copies of a fleet, its disturbances and its observers, advanced together.
 
     Args:
@@ -55,7 +52,9 @@ class Simulator:
 
     Attributes:
         state: all arrays that a step reads and writes, batch last.
+        before: the state at the beginning of the last step.
         observers: this simulator's own copy.
+        longest_step: longest step in s that all drifts take (`AgentModel.explicit_step`); inf if they take any.
         running_extremes: the arrays that `extremes` copies; overwritten by steps.
 
     Raises:
@@ -82,7 +81,7 @@ class Simulator:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1; got {num_envs!r}")
         self.design, self.fleet, self.initial, self.num_envs = design, design.fleet, initial, num_envs
-        self.disturbance = disturbance
+        self.disturbance, self._observe = disturbance, observe
         bound = self.fleet.input_map_bound  # an unbounded g can't be checked here; `reset` checks its initial value
         design.require_feasible_start(initial.radius, np.where(np.isfinite(bound), bound, 0.0))
         self.observers: Observers = copy.copy(observers or Proximal())  # its buffers are this simulator's own
@@ -101,76 +100,17 @@ class Simulator:
             drawn=np.zeros((num_envs, 0 if attached is None else attached.draws)),
             memory=self.observers.allocate(),
         )
-        self._before, self._interrupted = self.state.copy(), False
-        self._compiled = compiled_step(self.plant, self.observers, self.state, self._before)
+        self.before, self._interrupted = self.state.copy(), False
+        self._compiled = compiled_step(self.plant, self.observers, self.state, self.before)
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach = np.abs(initial.center) + initial.radius
-        self._longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
+        self.longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
         self.reset(seed=0)
-
-    # -- reading -------------------------------------------------------------------------------------------------
 
     def __repr__(self) -> str:
         law = self.plant.law
         name = "no law" if law is None else f"law {getattr(law, '__name__', None) or repr(law)}"
         return f"Simulator({self.design}; {self.observers!r}, {name}, num_envs={self.num_envs}, {spread(self.state.t)})"
-
-    @property
-    def t(self) -> FloatArray:
-        """(B,) time since reset in s."""
-        return read_only(self.state.t.view())
-
-    @property
-    def x(self) -> FloatArray:
-        """(B, n) true states; `fleet.state_slice(i)` is agent i's part."""
-        return read_only(self.state.x.T)
-
-    @property
-    def u(self) -> FloatArray:
-        """(B, m) inputs in force."""
-        return read_only(self.state.u.T)
-
-    @property
-    def g(self) -> FloatArray:
-        """(B, n) their effect g_i(x_i, u_i) on the states."""
-        return read_only(self.state.g.T)
-
-    @property
-    def estimates(self) -> FloatArray:
-        """(B, P) state estimates in the order of `observers.layout`."""
-        return read_only(self.state.memory["estimate"].T)
-
-    @property
-    def input_estimates(self) -> FloatArray:
-        """(B, Q) estimates of g in the order of `design.inputs.layout`."""
-        return read_only(self.state.memory["input_estimate"].T)
-
-    @property
-    def extremes(self) -> Extremes:
-        """The largest ratios at any grid point since the last reset."""
-        return self.running_extremes.copied()
-
-    def error_bounds(self) -> Certified:
-        """The guaranteed bound on the error of every estimate now, (P, B), batch last, and its basis."""
-        return self.observers.bound(self.state, np.empty_like(self.state.memory["estimate"]))
-
-    def errors(self) -> FloatArray:
-        """(B, P) estimation errors x_tilde."""
-        return self.estimates - self.x[:, self.observers.layout.column_source]
-
-    def disagreements(self) -> FloatArray:
-        """(B, P) disagreements xi."""
-        return self._disagreement(self.design.states, "estimate", self.state.x)
-
-    def input_errors(self) -> FloatArray:
-        """(B, Q) estimation errors of g."""
-        return self.input_estimates - self.g[:, self.design.inputs.layout.column_source]
-
-    def input_disagreements(self) -> FloatArray:
-        """(B, Q) input disagreements mu."""
-        return self._disagreement(self.design.inputs, "input_estimate", self.state.g)
-
-    # -- writing -------------------------------------------------------------------------------------------------
 
     def reset(
         self,
@@ -238,7 +178,35 @@ class Simulator:
         if u is not None:
             self.state.u.T[...] = self.plant.checked_inputs(u)
             self.plant.actuate(self.state)
-        self.advance(float(dt), parts)
+        self.step_unchecked(float(dt), parts)
+
+    def advance(self, until: float, *, tolerance: float, u: ArrayLike | None = None) -> StepCount:
+        """Advance every environment to a time, in steps that are as long as their estimated errors allow.
+
+        For the proximal step of order 2 or 3; order 3 takes the fewest steps. All environments take the same ones, so
+        that they have to be at the same time, and an environment's result depends on the others, within the tolerance.
+
+        Args:
+            until: time since reset in s, not before the present.
+            tolerance: largest estimated error of a step in every state and estimate, relative to 1 + |value|.
+            u: as in `step`.
+
+        Returns:
+            How many steps were taken, and how many taken back.
+
+        Raises:
+            ValueError: for a time that isn't finite or is past, a tolerance that isn't from 1e-9 to 1, other observers,
+                environments at different times, or inputs as in `step`; the state is unchanged.
+            SolveError: if a right-hand side gives numbers that aren't finite; the state is that of the last step.
+        """
+        self._require_whole()
+        control = StepControl(self, tolerance)
+        control.require(until)
+        if u is not None:
+            self.state.u.T[...] = self.plant.checked_inputs(u)
+            self.plant.actuate(self.state)
+        control.run(until)
+        return StepCount(control.accepted, control.rejected)
 
     def hold(self, u: FloatArray) -> None:
         """Hold inputs from now on, without checks: for callers that have checked them.
@@ -255,44 +223,54 @@ class Simulator:
         Raises:
             ValueError: for more than `MOST_PARTS`.
         """
-        parts = parts_of_step(dt, self._longest_step, f"the drift of {self.fleet.ids[self._stiffest]!r}")
+        parts = parts_of_step(dt, self.longest_step, f"the drift of {self.fleet.ids[self._stiffest]!r}")
         return max(parts, parts_of_step(dt, self.observers.longest_step, "the period of messages"))
 
-    def advance(self, dt: float, parts: int) -> None:
+    def step_unchecked(self, dt: float, parts: int) -> None:
         """`step` with the inputs in force, without checks: for callers that have checked the step.
 
         Args:
             dt: step in s.
             parts: `parts_of(dt)`.
         """
-        if self._interrupted:
-            raise RuntimeError(
-                "the last step was interrupted half-way: reset all environments, or restore a saved state, to go on"
-            )
-        state, before, copied = self.state, self._before, self.observers.copied
+        self._require_whole()
+        state, before, copied = self.state, self.before, self.observers.copied
         whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
         start = state.copy() if parts > 1 else before
-        if self._compiled is None:
-            state.copy_step(before, copied)
+        self.keep()
         try:
             for part in range(parts):
-                if self._compiled is not None:
-                    self._compiled(dt / parts, self.running_extremes)
-                    continue
                 if part:
-                    state.copy_step(before, copied)
-                self.observers.advance(self.plant, before, state, dt / parts)
-                self.observers.raise_extremes(state, self.running_extremes)
+                    self.keep()
+                self.one_step(dt / parts)
         except BaseException as error:
             start.copy_step(state, whole)
             self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
             raise
 
+    def keep(self) -> None:
+        """Make `before` the present state, unless the compiled step does; for callers of `one_step`."""
+        if self._compiled is None:
+            self.state.copy_step(self.before, self.observers.copied)
+
+    def one_step(self, dt: float) -> None:
+        """Advance from `before`, the present state, by a single step of `dt` seconds, and raise the extremes.
+
+        Raises:
+            FunnelError: as `step`; the state is undefined then, and `before` is as it was.
+            SolveError: likewise.
+        """
+        if self._compiled is not None:
+            self._compiled(dt, self.running_extremes)
+        else:
+            self.observers.advance(self.plant, self.before, self.state, dt)
+            self.observers.raise_extremes(self.state, self.running_extremes)
+
     def warm_up(self) -> None:
         """Compile all code that a step runs; the state is unchanged."""
         saved, extremes = self.save(), self.running_extremes.copied()
         try:
-            self.advance(_WARM_UP_STEP, 1)
+            self.step_unchecked(_WARM_UP_STEP, 1)
         except (FunnelError, SolveError):
             pass  # the first real step will raise it again
         finally:
@@ -319,6 +297,19 @@ class Simulator:
         for running in self.running_extremes:
             running[...] = 0.0
 
+    def resized(self, num_envs: int) -> Simulator:
+        """A simulator of the same closed loop with another number of environments, reset with seed 0."""
+        return Simulator(
+            self.design,
+            self.initial,
+            disturbance=self.disturbance,
+            law=self.plant.law,
+            task=self.task_graph,
+            observe=self._observe,
+            observers=self.observers,
+            num_envs=num_envs,
+        )
+
     def env_list(self, env_ids: Sequence[int] | IntArray | None) -> IntArray:
         """Indices of environments, checked; all of them for None.
 
@@ -335,6 +326,12 @@ class Simulator:
             raise ValueError(f"env_ids must be different indices from 0 to {self.num_envs - 1}; got {env_ids!r}")
         return chosen.astype(np.int64)
 
+    def _require_whole(self) -> None:
+        if self._interrupted:
+            raise RuntimeError(
+                "the last step was interrupted half-way: reset all environments, or restore a saved state, to go on"
+            )
+
     def _initial_states(self, x0: ArrayLike | None, count: int) -> FloatArray | None:
         """Check initial states, before anything is overwritten."""
         if x0 is None:
@@ -347,10 +344,3 @@ class Simulator:
         away = np.abs(states - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
         self.design.require_feasible_start(away, np.zeros(self.fleet.n))
         return states
-
-    def _disagreement(self, funnels: Funnels, memory: str, source: FloatArray) -> FloatArray:
-        links = None if self.design.schedule is None else LinksNow(self.design, self.num_envs)
-        weights = weights_at(links, self.state)[funnels is self.design.inputs]
-        out = np.zeros((funnels.layout.size, self.num_envs))
-        disagreement_by(funnels.layout, weights, self.state.memory[memory], source, out)
-        return out.T

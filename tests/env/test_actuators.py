@@ -23,7 +23,7 @@ def made(actuator, name="mixed_fleet", **arguments):
 def recorded(env):
     """The inputs that the simulator is stepped with, as fractions of the limits, one (m,) per substep."""
     simulator, seen = env.batched.simulator, []
-    advance = simulator.advance
+    advance = simulator.step_unchecked
 
     def spied(dt, parts):
         assert dt == pytest.approx(PERIOD / SUBSTEPS)
@@ -32,7 +32,7 @@ def recorded(env):
         advance(dt, parts)
         np.testing.assert_array_equal(simulator.u, held)
 
-    simulator.advance = spied
+    simulator.step_unchecked = spied
     return seen
 
 

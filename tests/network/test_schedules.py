@@ -261,3 +261,53 @@ class TestAsUsersWriteThem:
 
         with pytest.raises(NotImplementedError, match=r"Own has no part\(links, positions, number\)"):
             Own().bind(Links.of(nx.path_graph(3)), np.zeros((3, 2), np.int64))
+
+
+class TestNextChange:
+    """The times up to which nothing changes but for agents' positions."""
+
+    @staticmethod
+    def after(schedule, times, batch=1, graph=RING):
+        activity = schedule.bind(Links.of(graph), np.arange(2 * len(graph)).reshape(-1, 2))
+        key = draw_keys([np.random.default_rng(b) for b in range(batch)])
+        return [activity.next_change(key, np.full(batch, float(t))) for t in times]
+
+    def test_of_graphs_that_switch(self):
+        graphs = RING, nx.Graph([(1, 2)]), nx.Graph([(2, 3)])
+        found = self.after(Switching(graphs, period=3.0), (0.0, 0.4, 1.0, 2.5, 3.0, 300.2))
+        assert np.ravel(found) == pytest.approx([1.0, 1.0, 2.0, 3.0, 4.0, 301.0], abs=1e-12)
+        found = self.after(Switching(graphs, times=(0, 0.5, 2)), (0.0, 0.5 - 5e-10, 1.0, 2.0, 5.0))
+        assert np.ravel(found) == pytest.approx([0.5, 2.0, 2.0, np.inf, np.inf], abs=1e-12)
+
+    def test_of_an_outage(self):
+        found = self.after(Outage(1.0, 0.5, agent=2), (0.0, 1.0 - 5e-10, 1.2, 1.5, 9.0))
+        assert np.ravel(found) == pytest.approx([1.0, 1.5, 1.5, np.inf, np.inf], abs=1e-12)
+
+    def test_of_all_parts_the_first(self):
+        joined = Outage(1.0, 0.5) & Switching((RING, RING), times=(0, 1.2)) & Range(2.0) & RandomLinks(0.5) & Fixed()
+        assert np.ravel(self.after(joined, (0.0, 1.1, 1.3))) == pytest.approx([1.0, 1.2, 1.5], abs=1e-12)
+
+    def test_of_a_schedule_that_does_not_say(self):
+        class Own(Schedule):
+            def part(self, links, positions, number):
+                return lambda key, t, x, out: None
+
+        assert self.after(Own(), (0.0,))[0] == np.inf
+
+    @given(seed=SEEDS, start=st.floats(0, 5), length=st.floats(1e-3, 5))
+    def test_links_do_not_change_before(self, seed, start, length):
+        """Of drawn outages, environment by environment: just before the change nothing has changed, at it all has."""
+        schedule, links = Outage((start, start + 2.0), (length, 2.0 * length), agent=1), Links.of(RING)
+        activity = schedule.bind(links, np.arange(12).reshape(-1, 2))
+        key = draw_keys([np.random.default_rng(seed + b) for b in range(3)])
+        t, x, out = np.zeros(3), np.zeros((12, 3)), np.zeros((len(links), 3), bool)
+        for change in range(3):
+            before = activity.up(key, t, x, out).copy()
+            following = activity.next_change(key, t)
+            if change == 2:
+                assert np.isinf(following).all()
+                break
+            assert np.all(following > t)
+            assert np.array_equal(activity.up(key, following - 2e-9, x, out), before)
+            assert (activity.up(key, following, x, out) != before).any(axis=0).all()
+            t = following
