@@ -297,8 +297,7 @@ class BatchedEnv:
         if self._driven.size:
             self.task.drive(self.world, physical)
             as_fractions(self._driven, physical, self._limit, inputs)
-        self.simulator.hold(physical)
-        self.simulator.step_unchecked(self._dt, self._parts)
+        self.simulator.step_unchecked(self._dt, self._parts, physical)
         self.task.moved(self.world, number)
 
     def _evaluate(self) -> Outcome:

@@ -18,7 +18,7 @@ from khop_env.observers.performance import exponentials
 from khop_env.observers.solve import solve
 from khop_env.physics.right_hand_sides import drifts, input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
-from khop_env.simulation.plant import FleetPlant, advance_plant, combine, require_finite
+from khop_env.simulation.plant import FleetPlant, advance_plant, combine, copy_block, require_finite
 from khop_env.simulation.state import SimulatorState
 from khop_env.threads import Range
 
@@ -268,25 +268,37 @@ class CompiledStep:
         )
         self._arrays = tuple(Values.of(state)), tuple(Values.of(before)), state.drawn, tuple(self._work)
 
-    def __call__(self, dt: float, extremes: Extremes) -> None:
+    def __call__(self, dt: float, extremes: Extremes, held: bool) -> None:
         """Advance by `dt` seconds, and raise the running maxima `extremes`.
+
+        Args:
+            dt: in s.
+            extremes: raised.
+            held: whether inputs are new, so that their effect has to be computed first.
 
         Raises:
             SolveError: if a number isn't finite; the state is undefined then.
         """
+        law, scheme = self._plant.edge_law(), self._observers.scheme(dt)
+        common = (*self._system, law, *scheme, *self._arrays, tuple(extremes), held)
+        if len(self._ranges) == 1:
+            self._settle(*step(*common, *self._ranges[0]))
+            return
+        for result in self._plant.threads.run(lambda range_: step(*common, *range_), self._ranges):
+            self._settle(*result)
+
+    def _settle(self, failure: int, evaluations: int, env: int, target: int) -> None:
+        """Count the work of a range; raise the error of what failed."""
         observers, state, work = self._observers, self._state, self._work
-        common = (*self._system, self._plant.edge_law(), *observers.scheme(dt), *self._arrays, tuple(extremes))
-
-        def part(range_: Range) -> tuple[int, int, int, int]:
-            return step(*common, *range_)
-
-        for failure, evaluations, env, target in self._plant.threads.run(part, self._ranges):
-            if failure == _STATE:
-                require_finite(state.x, self._plant.fleet)
-            of_inputs = failure == _INPUTS
-            funnels = observers.design.inputs if of_inputs else observers.design.states
-            source, rho = (state.g, work.omega) if of_inputs else (state.x, work.rho)
-            observers.account([(evaluations, env, target)], funnels, source, rho)
+        if not failure:
+            observers.evaluations += evaluations
+            return
+        if failure == _STATE:
+            require_finite(state.x, self._plant.fleet)
+        of_inputs = failure == _INPUTS
+        funnels = observers.design.inputs if of_inputs else observers.design.states
+        source, rho = (state.g, work.omega) if of_inputs else (state.x, work.rho)
+        observers.account([(evaluations, env, target)], funnels, source, rho)
 
 
 def compiled_step(
@@ -319,6 +331,7 @@ def step(
     drawn: FloatArray,
     work: Any,
     extremes: Any,
+    held: bool,
     low: int,
     high: int,
 ) -> tuple[int, int, int, int]:
@@ -336,6 +349,7 @@ def step(
         drawn: (B, K) the disturbance's random numbers.
         work: the fields of `Work`.
         extremes: those of `Extremes`.
+        held: whether the effect of the inputs has to be computed first.
         low: first environment.
         high: one past the last.
 
@@ -352,6 +366,8 @@ def step(
     observed, evaluations = system.inputs[0].size, 0
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
+        if held:
+            input_maps(system.runs, now.x, now.u, now.g, begin, end)
         keep(now, before, begin, end)
         for s in range(nodes.size):
             predict(system, now, work.predicted[s], begin, end)
@@ -437,14 +453,6 @@ def keep(now: Any, before: Any, low: int, high: int) -> None:
     copy_block(now.input_estimate, before.input_estimate, low, high)
     copy_block(now.eps, before.eps, low, high)
     copy_block(now.nu, before.nu, low, high)
-
-
-@inlined
-def copy_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
-    """Copy the columns low to high - 1."""
-    for row in range(values.shape[0]):
-        for e in range(high - low):
-            out[row, place(low + e)] = values[row, place(low + e)]
 
 
 @inlined

@@ -208,15 +208,6 @@ class Simulator(Readings):
         control.run(until)
         return StepCount(control.accepted, control.rejected)
 
-    def hold(self, u: FloatArray) -> None:
-        """Hold inputs from now on, without checks: for callers that have checked them.
-
-        Args:
-            u: (m, B) physical inputs, batch last and finite; the simulator has no law.
-        """
-        self.state.u[...] = u
-        self.plant.actuate(self.state)
-
     def parts_of(self, dt: float) -> int:
         """Number of equal parts into which `step` divides a step, so that the plant's drift is stable in each of them.
 
@@ -226,14 +217,21 @@ class Simulator(Readings):
         parts = parts_of_step(dt, self.longest_step, f"the drift of {self.fleet.ids[self._stiffest]!r}")
         return max(parts, parts_of_step(dt, self.observers.longest_step, "the period of messages"))
 
-    def step_unchecked(self, dt: float, parts: int) -> None:
-        """`step` with the inputs in force, without checks: for callers that have checked the step.
+    def step_unchecked(self, dt: float, parts: int, u: FloatArray | None = None) -> None:
+        """`step` without checks: for callers that have checked the step and the inputs.
 
         Args:
             dt: step in s.
             parts: `parts_of(dt)`.
+            u: (m, B) physical inputs to hold from now on, batch last and finite, where there is no law.
         """
         self._require_whole()
+        held = False
+        if u is not None:
+            self.state.u[...] = u
+            held = self._compiled is not None and parts == 1  # it computes their effect itself
+            if not held:
+                self.plant.actuate(self.state)
         state, before, copied = self.state, self.before, self.observers.copied
         whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
         start = state.copy() if parts > 1 else before
@@ -242,7 +240,7 @@ class Simulator(Readings):
             for part in range(parts):
                 if part:
                     self.keep()
-                self.one_step(dt / parts)
+                self.one_step(dt / parts, held)
         except BaseException as error:
             start.copy_step(state, whole)
             self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
@@ -253,15 +251,19 @@ class Simulator(Readings):
         if self._compiled is None:
             self.state.copy_step(self.before, self.observers.copied)
 
-    def one_step(self, dt: float) -> None:
+    def one_step(self, dt: float, held: bool = False) -> None:
         """Advance from `before`, the present state, by a single step of `dt` seconds, and raise the extremes.
+
+        Args:
+            dt: in s.
+            held: whether the effect of the inputs has to be computed first, by the compiled step.
 
         Raises:
             FunnelError: as `step`; the state is undefined then, and `before` is as it was.
             SolveError: likewise.
         """
         if self._compiled is not None:
-            self._compiled(dt, self.running_extremes)
+            self._compiled(dt, self.running_extremes, held)
         else:
             self.observers.advance(self.plant, self.before, self.state, dt)
             self.observers.raise_extremes(self.state, self.running_extremes)
