@@ -79,7 +79,7 @@ def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str
         ("solve", observers, ("_solve_states", "_solve_inputs")),
         ("right-hand sides", simulator.plant, ("rate", "actuate")),
         ("right-hand sides", observers.prediction, ("rate",)),
-        ("observation", env, ("_read_observations",)),
+        ("observation", env._read_observations, ("write",)),
     ):
         for attribute in attributes:
             setattr(holder, attribute, _timed(getattr(holder, attribute), name, spent))
