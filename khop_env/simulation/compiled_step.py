@@ -20,7 +20,6 @@ from khop_env.physics.right_hand_sides import drifts, input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
 from khop_env.simulation.plant import FleetPlant, advance_plant, combine, copy_block, require_finite
 from khop_env.simulation.state import SimulatorState
-from khop_env.threads import Range
 
 BLOCK = 128  # environments: enough to fill vector registers, few enough for the cache
 _STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
