@@ -203,7 +203,7 @@ def test_a_change_in_another_file_is_seen(tmp_path):
 
 
 def kernels(tree: ast.Module) -> Iterator[ast.FunctionDef]:
-    """Functions below one of the two decorators."""
+    """Functions below one of the decorators."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef):
             names = {decorator.id for decorator in node.decorator_list if isinstance(decorator, ast.Name)}

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from khop_env.compiled import compiled, inlined, numba, pasted, place
-from khop_env.observers import Extremes, FloatArray, IntArray, Observers, Proximal
+from khop_env.observers import FloatArray, IntArray, Observers, Proximal
+from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
 from khop_env.observers.performance import exponentials
 from khop_env.observers.solve import solve
