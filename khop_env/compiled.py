@@ -36,7 +36,7 @@ except ImportError:  # kernels then run as plain Python: slow, but enough for on
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Marks of files whose text kernels depend on; compiled code knows the fields of a named tuple by position only.
-_MARKS = (b"@compiled", b"@inlined", b"NamedTuple")
+_MARKS = (b"@compiled", b"@inlined", b"@pasted", b"NamedTuple")
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -60,7 +60,15 @@ def inlined(function: F) -> F:
     return _cached(function, forceinline=True)
 
 
-def _cached(function: F, **options: bool) -> F:
+def pasted(function: F) -> F:
+    """Like `inlined`, but by Numba: for a line or two that are called with many constants.
+
+    `inlined` would compile a copy for each constant, before LLVM pastes it.
+    """
+    return _cached(function, inline="always")
+
+
+def _cached(function: F, **options: Any) -> F:
     if numba is None:
         return function
     compile_with = functools.partial(numba.njit, nogil=True, error_model="numpy", **options)

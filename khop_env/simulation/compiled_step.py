@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled, inlined, numba, place
-from khop_env.observers import Extremes, FloatArray, IntArray, Observers, Proximal
+from khop_env.compiled import compiled, inlined, numba, pasted, place
+from khop_env.observers import FloatArray, IntArray, Observers, Proximal
+from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
 from khop_env.observers.performance import exponentials
 from khop_env.observers.solve import solve
@@ -105,19 +106,19 @@ def packed(system: System) -> tuple[IntArray, FloatArray]:
 _INTEGERS, _FLOATS = 49, 18
 
 
-@inlined
+@pasted
 def integers_at(integers: IntArray, q: int) -> IntArray:
     """Array q of the integers of `packed`."""
     return integers[integers[q] : integers[q + 1]]
 
 
-@inlined
+@pasted
 def floats_at(integers: IntArray, floats: FloatArray, q: int) -> FloatArray:
     """Array q of the floats."""
     return floats[integers[_INTEGERS + 1 + q] : integers[_INTEGERS + 2 + q]]
 
 
-@inlined
+@pasted
 def pairs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     """The fields of `PairArrays`, whose first array of integers is q and of floats r."""
     return (
@@ -136,7 +137,7 @@ def pairs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     )
 
 
-@inlined
+@pasted
 def runs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     """The fields of `Runs`, likewise."""
     return (
@@ -151,7 +152,7 @@ def runs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     )
 
 
-@inlined
+@pasted
 def unpacked(n: IntArray, f: FloatArray) -> Any:
     """The `System` that was `packed`."""
     sizes = integers_at(n, 48)
