@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled, inlined, numba, pasted, place
+from khop_env.compiled import available, compiled, inlined, numba, pasted, place
 from khop_env.observers import FloatArray, IntArray, Observers, Proximal
 from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
@@ -22,6 +22,8 @@ from khop_env.simulation.edge_law import HELD, command_inputs
 from khop_env.simulation.plant import FleetPlant, advance_plant, combine, copy_block, require_finite
 from khop_env.simulation.state import SimulatorState
 
+PATIENCE = 2000
+"""Steps of a simulator in Python before the compiled step is compiled, where it hasn't been yet."""
 BLOCK = 128  # environments: enough to fill vector registers, few enough for the cache
 _STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
 
@@ -227,6 +229,7 @@ class CompiledStep:
         design, fleet, batch = observers.design, plant.fleet, plant.num_envs
         self._plant, self._observers, self._state = plant, observers, state
         self._ranges = plant.threads.ranges(batch)
+        self._waited = -1  # steps since its code was looked for on disk
         states, inputs, edges = design.states, design.inputs, plant.edges
         runs, input_runs, all_drifts = observers.prediction.compiled_runs()
         self._system = packed(
@@ -257,6 +260,21 @@ class CompiledStep:
         )
         self._arrays = tuple(Values.of(state)), tuple(Values.of(before)), state.drawn, tuple(self._work)
 
+    def ready(self, extremes: Extremes, now: bool = False) -> bool:
+        """Whether to use it for the next step, of which this is asked once.
+
+        Its code takes longer to compile than short runs take in Python. So it is used from the first step where it has
+        been compiled before, and otherwise compiled after `PATIENCE` steps, or `now`.
+        """
+        if self._waited < 0 and available(step, *self._arguments(1.0, extremes, False), 0, 0):
+            self._waited = PATIENCE
+        self._waited = PATIENCE if now else self._waited + 1
+        return self._waited >= PATIENCE
+
+    def _arguments(self, dt: float, extremes: Extremes, held: bool) -> tuple[Any, ...]:
+        law, scheme = self._plant.edge_law(), self._observers.scheme(dt)
+        return (*self._system, law, *scheme, *self._arrays, tuple(extremes), held)
+
     def __call__(self, dt: float, extremes: Extremes, held: bool) -> None:
         """Advance by `dt` seconds, and raise the running maxima `extremes`.
 
@@ -268,8 +286,7 @@ class CompiledStep:
         Raises:
             SolveError: if a number isn't finite; the state is undefined then.
         """
-        law, scheme = self._plant.edge_law(), self._observers.scheme(dt)
-        common = (*self._system, law, *scheme, *self._arrays, tuple(extremes), held)
+        common: Any = self._arguments(dt, extremes, held)
         if len(self._ranges) == 1:
             self._settle(*step(*common, *self._ranges[0]))
             return

@@ -102,6 +102,7 @@ class Simulator(Readings):
         )
         self.before, self._interrupted = self.state.copy(), False
         self._compiled = compiled_step(self.plant, self.observers, self.state, self.before)
+        self._in_one_call = False
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach = np.abs(initial.center) + initial.radius
         self.longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
@@ -226,50 +227,59 @@ class Simulator(Readings):
             u: (m, B) physical inputs to hold from now on, batch last and finite, where there is no law.
         """
         self._require_whole()
+        state, before, copied = self.state, self.before, self.observers.copied
+        self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
         held = False
         if u is not None:
-            self.state.u[...] = u
-            held = self._compiled is not None and parts == 1  # it computes their effect itself
+            state.u[...] = u
+            held = self._in_one_call and parts == 1  # the compiled step computes their effect itself
             if not held:
-                self.plant.actuate(self.state)
-        state, before, copied = self.state, self.before, self.observers.copied
+                self.plant.actuate(state)
         whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
         start = state.copy() if parts > 1 else before
-        self.keep()
+        self._keep()  # not in the block below: where it is interrupted halfway nothing has to be restored
         try:
             for part in range(parts):
                 if part:
-                    self.keep()
-                self.one_step(dt / parts, held)
+                    self._keep()
+                self._one_step(dt / parts, held)
         except BaseException as error:
             start.copy_step(state, whole)
             self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
             raise
 
-    def keep(self) -> None:
-        """Make `before` the present state, unless the compiled step does; for callers of `one_step`."""
-        if self._compiled is None:
-            self.state.copy_step(self.before, self.observers.copied)
-
-    def one_step(self, dt: float, held: bool = False) -> None:
-        """Advance from `before`, the present state, by a single step of `dt` seconds, and raise the extremes.
-
-        Args:
-            dt: in s.
-            held: whether the effect of the inputs has to be computed first, by the compiled step.
+    def try_step(self, dt: float) -> None:
+        """Advance by a single step of `dt` seconds, and raise the extremes. `before` is the state before it.
 
         Raises:
-            FunnelError: as `step`; the state is undefined then, and `before` is as it was.
+            FunnelError: as `step`; the state is undefined then.
             SolveError: likewise.
         """
-        if self._compiled is not None:
+        self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
+        self._keep()
+        self._one_step(dt, False)
+
+    def _keep(self) -> None:
+        """Copy the present state to `before`, unless the compiled step does."""
+        if not self._in_one_call:
+            self.state.copy_step(self.before, self.observers.copied)
+
+    def _one_step(self, dt: float, held: bool) -> None:
+        if self._in_one_call:
+            assert self._compiled is not None
             self._compiled(dt, self.running_extremes, held)
         else:
             self.observers.advance(self.plant, self.before, self.state, dt)
             self.observers.raise_extremes(self.state, self.running_extremes)
 
-    def warm_up(self) -> None:
-        """Compile all code that a step runs; the state is unchanged."""
+    def warm_up(self, long: bool = False) -> None:
+        """Compile all code that the next step runs; the state is unchanged.
+
+        Args:
+            long: whether to compile what only runs of thousands of steps would compile, too.
+        """
+        if long and self._compiled is not None:
+            self._compiled.ready(self.running_extremes, now=True)
         saved, extremes = self.save(), self.running_extremes.copied()
         try:
             self.step_unchecked(_WARM_UP_STEP, 1)
