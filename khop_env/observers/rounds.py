@@ -97,10 +97,7 @@ class Rounds:
         self._states = _held(states, estimate, 1, known)
         self._inputs = _held(inputs, input_estimate, own_input, heard)
         self._rho, self._omega = np.ones((states.rows, num_envs)), np.ones((inputs.rows, num_envs))
-        known_drifts = [
-            Drift(fleet.models[i], fleet.models[i].drift) if design.options[i].drift else None
-            for i in states.target.tolist()
-        ]
+        known_drifts = [Drift(fleet.models[i]) if design.options[i].drift else None for i in states.target.tolist()]
         self._drifts = Drifts(states, known_drifts, num_envs)
         self.divisible = self._drifts.divisible
         self._rate = np.zeros((states.size, num_envs))
