@@ -315,7 +315,7 @@ def _observers_of(settings: Settings, scenario: Scenario, num_envs: int) -> tupl
         )
     estimator = settings.estimator or scenario.estimator
     chosen = dataclasses.replace(settings, network=network, estimator=estimator)
-    return chosen, Networked(network, estimator, settings.message_size, settings.threads)
+    return chosen, Networked(network, estimator, settings.message_size, settings.threads_for(num_envs))
 
 
 def _chosen_scenario(scenario_or_name: Scenario | str | Path) -> Scenario:
