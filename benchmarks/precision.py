@@ -36,10 +36,13 @@ DURATION = 10.0  # s
 INTERVAL = 0.01  # s, between the instants
 ACCURACY = 2e-3  # of the rows of `khop bench`: largest error, in the states' units
 TOLERANCES = tuple(10.0 ** (-k / 4) for k in range(6, 21))  # 0.03 to 1e-5
+_ONCE = 3.0  # s, above which a run isn't repeated
 SOLVERS = ("LSODA", "BDF", "Radau")
 ROWS = tuple(f"speedup_vs_scipy{kind}" for kind in ("", "_fixed", "_batch", "_mixed_fleet"))
 Run = Callable[[], FloatArray | None]
 """Integrates, and returns the states (instants, n); None where it failed."""
+Points = dict[str, list[tuple[float, float]]]
+"""By method: errors, and times in s."""
 
 
 @compiled
@@ -247,9 +250,7 @@ def scipy_rows(report: Report, quick: bool, say: Callable[[str], None], batch: i
             report.add("speedup_vs_scipy_batch", seconds["theirs"] / (seconds["batch"] / batch))
 
 
-def work_precision(
-    name: str, repeats: int = 3, say: Callable[[str], None] = print
-) -> dict[str, list[tuple[float, float]]]:
+def work_precision(name: str, say: Callable[[str], None], repeats: int = 3) -> Points:
     """Error and median time in s of each method, from loose to tight."""
     problem = Problem(name)
     proximal = {f"proximal, order {order}": partial(problem.steps, order) for order in (1, 2, 3)}
@@ -260,22 +261,28 @@ def work_precision(
     methods |= {method: (partial(problem.scipy, method), TOLERANCES[2::4]) for method in SOLVERS}
     if name == "paper":
         methods["explicit"] = problem.explicit, [2e-5, 1e-5]
-    runs, errors = {}, {}
+    runs, errors, seconds = {}, {}, {}
     for method, (make, settings) in methods.items():
         for setting in settings:
             run = make(setting)
+            start = time.perf_counter()
             errors[method, setting] = error = problem.error(run())
-            say(f"  {name}, {method}, {setting:.3g}: error {error:.3g}")
+            taken = time.perf_counter() - start
+            say(f"  {name}, {method}, {setting:.3g}: error {error:.3g}, {taken:.3g} s")
             if np.isfinite(error):
-                runs[method, setting] = run
-    seconds = medians(runs, repeats)
-    found: dict[str, list[tuple[float, float]]] = {}
+                seconds[method, setting] = taken
+                if taken < _ONCE:
+                    runs[method, setting] = run
+            elif taken > _ONCE:
+                break  # tighter ones take longer still
+    seconds |= medians(runs, repeats)
+    found: Points = {}
     for (method, setting), taken in seconds.items():
         found.setdefault(method, []).append((errors[method, setting], taken))
     return found
 
 
-def figure(points: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], path: Path) -> None:
+def figure(points: Mapping[str, Points], path: Path) -> None:
     """Draw time against error, one panel per scenario."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure

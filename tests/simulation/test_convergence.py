@@ -53,7 +53,8 @@ def test_order_of_convergence(order, reference):
     slopes = [np.polyfit(np.log(STEPS), np.log(row), 1)[0] for row in errors]
     for name, slope, row in zip(("x", "estimates", "input estimates"), slopes, errors, strict=True):
         print(f"order {order}, {name}: slope {slope:.3f}, error {row[-1]:.1e} at 1e-3 s, {row[0]:.1e} at 1e-2 s")
-    assert slopes == pytest.approx([order] * 3, abs=0.25)
+    lowest = 2.3 if order == 3 else order - 0.25  # in a stiff problem the inner stages of ARS(4,4,3) are of order 1
+    assert all(lowest < slope < order + 0.25 for slope in slopes)
 
 
 @pytest.mark.parametrize(
