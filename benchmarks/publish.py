@@ -2,7 +2,7 @@
 
     .venv/bin/python -m benchmarks.publish networks safety     # half an hour on two cores
     .venv/bin/python -m benchmarks.publish speed --peers .peers
-    .venv/bin/python -m benchmarks.publish precision           # five minutes
+    OPENBLAS_NUM_THREADS=1 .venv/bin/python -m benchmarks.publish precision    # three minutes
 
 The tables on learning are written by `benchmarks.publish_table`.
 """
@@ -83,7 +83,7 @@ def speed(options: argparse.Namespace) -> Iterable[str]:
 
 def precision(options: argparse.Namespace) -> Iterable[str]:
     """Time against error, and its figure."""
-    yield stamp("python -m benchmarks.publish precision")
+    yield stamp("OPENBLAS_NUM_THREADS=1 python -m benchmarks.publish precision")
     points = {name: work_precision(name, say) for name in ("paper", "mixed_fleet")}
     figure(points, options.docs / "images" / "work_precision.png")
     yield from ("", "| scenario, method | largest error, and time for 10 s (ms) |", "|---|---|")
