@@ -22,6 +22,8 @@ from benchmarks.comparison import left_out
 from benchmarks.environments import environment_rows
 from benchmarks.growth import growth_rows
 from benchmarks.networks import network_rows, violation_rows
+from benchmarks.precision import ACCURACY, scipy_rows
+from benchmarks.precision import ROWS as SCIPY_ROWS
 from benchmarks.report import Report, reason
 from benchmarks.safety import collision_rows
 from benchmarks.safety_speed import speed_rows
@@ -34,7 +36,6 @@ from khop_env.scenarios import Scenario, paper
 from khop_env.simulation import Simulator
 
 DURATION = 10.0  # s, of the closed loop
-ACCURACY = 2e-3  # largest admissible error of x of a method over it
 DT = 0.01
 EXPLICIT_DT = 1e-5
 BATCH = 64
@@ -51,7 +52,6 @@ PARTS = (
     "training",
 )
 """Keys of the parts, in the order in which they are measured."""
-SCIPY_ROWS = ("speedup_vs_scipy", "speedup_vs_scipy_batch")
 Progress = Callable[[str], None]
 
 
@@ -107,9 +107,9 @@ def benchmark(
         ),
         Part(
             "scipy",
-            "proximal against SciPy's stiff solvers",
-            0.5,
-            partial(_against_scipy, report, quick, say),
+            "steps of controlled size against SciPy's LSODA",
+            0.7,
+            partial(scipy_rows, report, quick, say),
             needs=("scipy",),
             rows=SCIPY_ROWS,
         ),
@@ -246,51 +246,6 @@ def _bare_time(elements: int, repeats: int) -> float:
     slope, curvature = np.empty(elements), np.empty(elements)
     bare_loop(e, slope, curvature, 1)
     return _best(lambda: bare_loop(e, slope, curvature, repeats), 3)
-
-
-def _against_scipy(report: Report, quick: bool, say: Progress) -> None:
-    """Time of SciPy's stiff solvers, at the loosest tolerance with the required accuracy, on the compiled equations."""
-    from scipy.integrate import solve_ivp
-
-    duration = 0.2 if quick else DURATION
-    reference = _trajectory(DT / 20, duration, every=20)
-    times = DT * np.arange(1, len(reference) + 1)
-    single = _simulator(paper(), 1)
-    _run(single, DT, 10 * DT)
-    ours = _best(lambda: _run(single, DT, duration), 5)
-    many = _simulator(paper(), BATCH)
-    _run(many, DT, 10 * DT)
-    ours_many = _best(lambda: _run(many, DT, duration), 2) / BATCH
-    single.reset(seed=0)
-    loop = CompiledPaper(single)
-    start = np.concatenate([block[:, 0] for block in loop.z])
-    best = np.inf
-    for method in ("BDF", "Radau", "LSODA"):
-        for tolerance in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
-            began = time.perf_counter()
-            try:
-                with np.errstate(all="ignore"):  # trial points outside the funnel
-                    found = solve_ivp(
-                        loop.derivative, (0.0, duration), start, method, t_eval=times, rtol=tolerance, atol=tolerance
-                    )
-            except ValueError:  # a Jacobian at such a point
-                continue
-            elapsed = time.perf_counter() - began
-            kept = found.success and np.abs(found.y[: reference.shape[1]].T - reference).max() <= ACCURACY
-            if kept:
-                say(f"  {method}: rtol = atol = {tolerance:g}, {elapsed:.2f} s")
-                best = min(best, elapsed)
-                break
-            if elapsed > 10.0 * ours * 1000.0:  # already a thousand times slower
-                break
-        else:
-            say(f"  {method}: {ACCURACY:g} not reached with rtol down to 1e-4")
-    if best == np.inf:
-        for name in SCIPY_ROWS:
-            report.skip(name, f"no solver kept the error below {ACCURACY:g}")
-        return
-    report.add("speedup_vs_scipy", best / ours, least=3.0)
-    report.add("speedup_vs_scipy_batch", best / ours_many)
 
 
 def _ratio_to_floor(quick: bool, batch: int = 1024) -> float:

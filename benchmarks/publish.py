@@ -2,6 +2,7 @@
 
     .venv/bin/python -m benchmarks.publish networks safety     # half an hour on two cores
     .venv/bin/python -m benchmarks.publish speed --peers .peers
+    OPENBLAS_NUM_THREADS=1 .venv/bin/python -m benchmarks.publish precision    # three minutes
 
 The tables on learning are written by `benchmarks.publish_table`.
 """
@@ -21,6 +22,7 @@ from typing import Any
 from agents import make_law
 from agents.workers import Interrupted
 from benchmarks.benchmark import benchmark
+from benchmarks.precision import figure, work_precision
 from benchmarks.safety_table import table
 from khop_env.network import PROFILES
 from khop_env.registry import scenario
@@ -79,6 +81,18 @@ def speed(options: argparse.Namespace) -> Iterable[str]:
         raise KeyboardInterrupt
 
 
+def precision(options: argparse.Namespace) -> Iterable[str]:
+    """Time against error, and its figure."""
+    yield stamp("OPENBLAS_NUM_THREADS=1 python -m benchmarks.publish precision")
+    points = {name: work_precision(name, say) for name in ("paper", "mixed_fleet")}
+    figure(points, options.docs / "images" / "work_precision.png")
+    yield from ("", "| scenario, method | largest error, and time for 10 s (ms) |", "|---|---|")
+    for name, methods in points.items():
+        for method, values in methods.items():
+            listed = "; ".join(f"{error:.1e}: {1e3 * seconds:.3g}" for error, seconds in values)
+            yield f"| `{name}`, {method} | {listed} |"
+
+
 def networks(options: argparse.Namespace) -> Iterable[str]:
     """Every profile, both estimators, on true states so that all rows have the same motion."""
     yield stamp("khop network paper --observe oracle")
@@ -134,6 +148,7 @@ def _rows(name: str, chosen: Sequence[Any], periods: Sequence[float] | None, epi
 
 TABLES: dict[str, Callable[[argparse.Namespace], Iterable[str]]] = {
     "speed": speed,
+    "precision": precision,
     "networks": networks,
     "noise": noise,
     "safety": safety,

@@ -223,13 +223,13 @@ class TestRun:
     def test_steps_of_controlled_size(self, folder):
         found = only_json(khop("run", "paper", "--tolerance", "1e-2", "--duration", "1", "--json"))
         assert (found["dt"], found["tolerance"], found["samples"]) == (None, 1e-2, 101)
-        assert found["steps"] < 60
+        assert (found["order"], found["steps"] < 60) == (3, True)
         assert found["funnel_kept"] is True
         assert found["configuration"]["tolerance"] == 1e-2
         for options, expected in (
             (["--dt", "0.01"], "--dt: the size of steps follows from --tolerance"),
-            (["--order", "1"], "--order 1: --tolerance estimates the error of the proximal step of order 2"),
-            (["--integrator", "explicit"], "--integrator explicit: --tolerance estimates"),
+            (["--order", "1"], "--order 1: --tolerance is for the proximal step of order 2 or 3"),
+            (["--integrator", "explicit"], "--integrator explicit: --tolerance is for"),
             (["--network", "wifi"], "--tolerance: over a network estimates follow from rounds of messages"),
             (["--controller", "random"], "--tolerance: a policy acts in its environment"),
         ):

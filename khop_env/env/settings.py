@@ -33,7 +33,7 @@ class Settings:
         max_cycles: control periods after which an episode is truncated; None for the scenario's duration.
         control_period: time between actions in s.
         dt: the simulator's step in s; the control period by default.
-        order: of the simulator's step, 1 or 2. Actions are held over a control period, so that the closed loop is of
+        order: of the simulator's step, 1, 2 or 3. Actions are held over a control period, so that the closed loop is of
             order 1 in it anyway; 2 integrates the motion between actions more accurately, at twice the time. Under a
             network 1.
         actuator: "direct", "lag", "slew", "hold", or an `Actuator`.

@@ -54,6 +54,11 @@ TABLEAUS = {
 MOST_THREADS = 256
 
 
+def _square(rows: tuple[tuple[float, ...], ...]) -> FloatArray:
+    """Rows of a tableau as a matrix (stages, stages)."""
+    return np.array([[*row, *[0.0] * (len(rows) - len(row))] for row in rows])
+
+
 class Stages(NamedTuple):
     """The parts of a step's stages.
 
@@ -100,8 +105,8 @@ class Proximal(FunnelObservers):
         self._tableau = TABLEAUS[order]
         self._explicit, self._implicit = self._tableau.explicit, self._tableau.implicit
         self._dt = math.nan
-        nothing = np.zeros((0, 0))
-        self._scheme = math.nan, (nothing, nothing, nothing)
+        self._unit = np.array(self._tableau.nodes), _square(self._explicit), _square(self._implicit)
+        self._scheme = math.nan, self._unit
 
     def __repr__(self) -> str:
         return f"Proximal(order={self.order}, threads={self.threads})"
@@ -154,11 +159,8 @@ class Proximal(FunnelObservers):
     def scheme(self, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times of the stages (S,), explicit and implicit weights (S, S), all in s, for a step of `dt` seconds."""
         if dt != self._scheme[0]:
-            count = len(self._tableau.nodes)
-            explicit, implicit = np.zeros((count, count)), np.zeros((count, count))
-            for s, (a, b, _) in enumerate(self._weights_of(dt)):
-                explicit[s, : s + 1], implicit[s, : s + 1] = a, b
-            self._scheme = dt, (np.array(self._tableau.nodes) * dt, explicit, implicit)
+            nodes, explicit, implicit = self._unit
+            self._scheme = dt, (nodes * dt, explicit * dt, implicit * dt)
         return self._scheme[1]
 
     def _weights_of(self, dt: float) -> list[tuple[FloatArray, FloatArray, float]]:

@@ -45,7 +45,7 @@ def write_scenario(scenario: Scenario) -> str:
         ("design_rule", "from delta to the funnels: paper, or sharp for the widest ones"),
         ("duration", "s"),
         ("dt", "s, step of the proximal integrator"),
-        ("order", "its order, 1 or 2"),
+        ("order", "its order, 1, 2 or 3"),
         ("figure_agent", "index of the agent whose estimates figures show"),
     ):
         content = getattr(scenario, name)

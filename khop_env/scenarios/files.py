@@ -87,7 +87,7 @@ def _scenario(root: CheckedTable, laws: Iterable[str] | None) -> Scenario:
         root.note("k", f"got {k}, expected at least {'2' if values['relay'] else '1 (without relay)'}")
         k = REQUIRED
     if values["order"] not in (1, 2):
-        root.note("order", f"got {values['order']}, expected 1 or 2")
+        root.note("order", f"got {values['order']}, expected 1, 2 or 3")
     with root.gathering():
         values |= _agents(root.tables("agents"))
     tables = {name: root.table(name) for name in ("communication", "task", "delta")}

@@ -149,8 +149,8 @@ class Scenario:
                 f"a scenario's name is also a folder's: 1 to 200 characters without '/'; got {self.name[:200]!r}"
             )
         require_parts(self.name, vars(self))
-        if self.order not in (1, 2):
-            raise ValueError(f"scenario {self.name!r}: order must be 1 or 2; got {self.order!r}")
+        if self.order not in (1, 2, 3):
+            raise ValueError(f"scenario {self.name!r}: order must be 1, 2 or 3; got {self.order!r}")
         if not 0 < len(self.models) <= MOST_AGENTS:
             raise ValueError(
                 f"scenario {self.name!r}: expected 1 to {MOST_AGENTS} models, one per agent; got {len(self.models)}"

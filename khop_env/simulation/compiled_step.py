@@ -286,11 +286,12 @@ class CompiledStep:
         Raises:
             SolveError: if a number isn't finite; the state is undefined then.
         """
-        common: Any = self._arguments(dt, extremes, held)
+        run: Any = step
+        common = self._arguments(dt, extremes, held)
         if len(self._ranges) == 1:
-            self._settle(*step(*common, *self._ranges[0]))
+            self._settle(*run(*common, *self._ranges[0]))
             return
-        for result in self._plant.threads.run(lambda range_: step(*common, *range_), self._ranges):
+        for result in self._plant.threads.run(lambda range_: run(*common, *range_), self._ranges):
             self._settle(*result)
 
     def _settle(self, failure: int, evaluations: int, env: int, target: int) -> None:

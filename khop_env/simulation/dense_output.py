@@ -17,7 +17,7 @@ from khop_env.simulation.step_control import StepControl
 if TYPE_CHECKING:
     from khop_env.simulation.simulator import Simulator
 
-_MOST_SAMPLES = 64  # that are completed together, as one batch of environments
+_MOST_SAMPLES = 32  # that are completed together, as one batch of environments
 _MOST_NUMBERS = 1_000_000  # estimates of such a batch
 
 

@@ -14,9 +14,11 @@ from benchmarks import environments, study
 from benchmarks.benchmark import benchmark
 from benchmarks.comparison import compare, left_out
 from benchmarks.growth import held_memory
+from benchmarks.precision import RightHandSide, cubic
 from benchmarks.report import Report
 from benchmarks.yardsticks import CompiledPaper
-from khop_env.observers import Explicit
+from khop_env.observers import Explicit, Proximal
+from khop_env.registry import scenario as scenario_of
 from khop_env.scenarios import paper
 
 
@@ -54,7 +56,9 @@ def test_every_promised_figure_is_printed():
         "explicit_to_floor",
         "speedup_vs_explicit_single",
         "speedup_vs_scipy",
+        "speedup_vs_scipy_fixed",
         "speedup_vs_scipy_batch",
+        "speedup_vs_scipy_mixed_fleet",
         "ratio_to_floor",
         "growth_time",
         "growth_memory",
@@ -196,14 +200,16 @@ def test_without_the_extras_the_rest_is_measured(quick_parts, monkeypatch):
     report = benchmark(quick=True, progress=lines.append)
     how = "in a clone of khop_env, pip install -c constraints.txt -e '.[bench]'"
     assert lines[:3] == [
-        f"left out: proximal against SciPy's stiff solvers (needs scipy: {how})",
+        f"left out: steps of controlled size against SciPy's LSODA (needs scipy: {how})",
         f"left out: training: PPO, 64 environments of 8 agents (needs stable_baselines3 and torch: {how})",
         "proximal against explicit, closed loop of `paper`",
     ]
     assert [(row["name"], row["value"], row["skipped"]) for row in report["rows"]] == [
         ("row 0", 1.0, None),
         ("speedup_vs_scipy", None, f"needs scipy: {how}"),
+        ("speedup_vs_scipy_fixed", None, f"needs scipy: {how}"),
         ("speedup_vs_scipy_batch", None, f"needs scipy: {how}"),
+        ("speedup_vs_scipy_mixed_fleet", None, f"needs scipy: {how}"),
         ("ratio_to_floor", 2.0, None),
         ("row 1", 1.0, None),
         ("row 2", None, "came out as inf"),
@@ -221,7 +227,7 @@ def test_what_was_measured_is_not_lost(quick_parts, monkeypatch, error):
     def broken(*arguments):
         raise error
 
-    monkeypatch.setattr(module, "_against_scipy", broken)
+    monkeypatch.setattr(module, "scipy_rows", broken)
     monkeypatch.setattr(module, "training_rows", broken)
     report = benchmark(quick=True)
     if isinstance(error, KeyboardInterrupt):
@@ -231,7 +237,7 @@ def test_what_was_measured_is_not_lost(quick_parts, monkeypatch, error):
         assert len(report["rows"]) == 8
         assert report["rows"][1]["skipped"] == "failed: RuntimeError: broken"
         assert report["failed"] == [
-            "proximal against SciPy's stiff solvers",
+            "steps of controlled size against SciPy's LSODA",
             "training: PPO, 64 environments of 8 agents",
         ]
         assert not report["interrupted"]
@@ -264,3 +270,29 @@ def test_memory_counts_arrays_and_objects_once_and_leaves_out_what_is_shared():
     held = held_memory([subject], besides=[shared])
     assert own.nbytes < held < own.nbytes + 3000
     assert own.nbytes + shared.nbytes < held_memory([subject], besides=[])
+
+
+def test_the_right_hand_side_for_scipy_is_the_simulators():
+    """A short explicit step by it is the explicit integrator's, of states and both kinds of estimates."""
+    for name in ("paper", "mixed_fleet"):
+        chosen = scenario_of(name)
+        simulator = chosen.build(law=make_law(chosen.law), observers=Proximal(2)).reset(1)
+        for _ in range(30):
+            simulator.step(0.01)
+        equations, t = RightHandSide(simulator), float(simulator.t[0])
+        explicit = chosen.build(law=make_law(chosen.law), observers=Explicit())
+        explicit.restore(simulator.save())
+        explicit.step(1e-6)
+        after = np.concatenate([explicit.x[0], explicit.estimates[0], explicit.input_estimates[0]])
+        np.testing.assert_allclose(
+            equations.start + 1e-6 * equations(t, equations.start), after, rtol=1e-11, atol=1e-13
+        )
+
+
+def test_dense_values_of_fixed_steps_are_cubic():
+    """Exact for polynomials of degree 3, at both ends as well."""
+    times, grid = np.linspace(0.0, 1.0, 41), np.linspace(0.0, 1.0, 11)
+    values = np.stack([grid**3 - grid, 2.0 - grid**2], axis=1)
+    np.testing.assert_allclose(
+        cubic(0.1, values, times), np.stack([times**3 - times, 2.0 - times**2], axis=1), atol=1e-14
+    )

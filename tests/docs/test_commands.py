@@ -80,7 +80,7 @@ def test_commands_on_a_page_exist(page):
     [
         ("khop runs paper", "no command"),
         ("    $ khop run paper --durations 3", "NoSuchOption"),
-        ("khop run paper --order 3", "BadParameter"),
+        ("khop run paper --order 4", "BadParameter"),
         ("khop run paper --seed -1", "BadParameter"),
         ("khop run", "MissingParameter"),
         ("khop run papers   # comment", "no scenario"),

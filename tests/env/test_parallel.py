@@ -236,7 +236,7 @@ WRONG_SETTINGS = {
     "success_radius": (float("nan"), "success_radius must be a positive, finite number of at most 1e30; got nan"),
     "limit": (float("inf"), "limit must be a positive, finite number of at most 1e30; got inf"),
     "effort": (-0.1, "effort must be finite and not negative; got -0.1"),
-    "order": (3, "exists at order 1 and 2; got order=3"),
+    "order": (4, "exists at order 1, 2 and 3; got order=4"),
     "threads": (0, "threads must be a positive integer or 'auto'; got 0"),
     "actuator": ("lagg", r"no actuator 'lagg'; did you mean 'lag'.*Lag\(time_constant=0.2\)"),
     "render_mode": ("rgb", "render_mode must be None, 'human' or 'rgb_array'; got 'rgb'$"),

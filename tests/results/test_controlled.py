@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from agents import make_law
 from khop_env.network import Outage
@@ -15,8 +16,8 @@ from tests.simulation.test_step_control import TOLERANCES, changing_systems
 from tests.strategies import SmoothSignals
 
 
-def simulator(chosen, **options):
-    return chosen.build(law=make_law(chosen.law), observers=Proximal(2), **options).reset(3)
+def simulator(chosen, order=3, **options):
+    return chosen.build(law=make_law(chosen.law), observers=Proximal(order), **options).reset(3)
 
 
 @pytest.fixture(scope="module")
@@ -32,14 +33,15 @@ def test_times_are_those_of_a_fixed_step(recording):
     assert record(simulator(paper()), 0.1, 0.01).rejected is None
 
 
+@pytest.mark.parametrize("order", [2, 3])
 @pytest.mark.parametrize("name", ["paper", "mixed_fleet"])
-def test_samples_are_as_accurate_as_steps(name):
+def test_samples_are_as_accurate_as_steps(name, order):
     """Within three times the tolerance of a fine fixed step: states, inputs and all estimates, at every sample."""
     chosen = scenario(name)
     true = record(simulator(chosen), 1.0, 5e-4)
     errors = []
     for tolerance in (1e-2, 1e-3):
-        found = record_controlled(simulator(chosen), 1.0, tolerance)
+        found = record_controlled(simulator(chosen, order), 1.0, tolerance)
         pairs = [(found.x, true.x), (found.states.estimate, true.states.estimate)]
         errors.append(max(np.abs(one - other).max() for one, other in pairs))
         assert errors[-1] < 3.0 * tolerance
@@ -71,10 +73,10 @@ def test_the_last_sample_is_the_last_state():
 
 
 @settings(max_examples=40)
-@given(system=changing_systems(), tolerance=TOLERANCES)
-def test_every_sample_keeps_the_guarantee(system, tolerance):
+@given(system=changing_systems(), tolerance=TOLERANCES, order=st.sampled_from([2, 3]))
+def test_every_sample_keeps_the_guarantee(system, tolerance, order):
     """Random systems, graphs that change, any tolerance; steps are much longer than samples are apart."""
-    sim = system.simulator(Proximal(2), law=SmoothSignals(system.design.fleet, system.seed))
+    sim = system.simulator(Proximal(order), law=SmoothSignals(system.design.fleet, system.seed))
     found = record_controlled(sim, 0.5, tolerance, samples_per_second=400.0)
     assert found.completed
     for kind in (found.states, found.inputs):
@@ -89,7 +91,7 @@ def test_a_failure_keeps_earlier_samples():
     def failing(t, view):
         return np.where(t[:, None] < 0.305, law(t, view), np.nan)
 
-    found = record_controlled(chosen.build(law=failing, observers=Proximal(2)).reset(3), 1.0, 1e-2)
+    found = record_controlled(chosen.build(law=failing, observers=Proximal(3)).reset(3), 1.0, 1e-2)
     assert isinstance(found.error, SolveError)
     assert found.time[:-1].tolist() == [round(0.01 * k, 12) for k in range(31)]
     assert 0.305 - 1e-6 < found.time[-1] < 0.305
@@ -105,7 +107,7 @@ def test_tables_and_summary(recording, capsys):
         paper(),
         seed=3,
         dt=None,
-        observers=Proximal(2),
+        observers=Proximal(3),
         controller="tanh",
         observe="estimate",
         tolerance=1e-3,

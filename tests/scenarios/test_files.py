@@ -214,7 +214,7 @@ REFUSALS = [  # (what is replaced, by what, the key named, what else the message
     ("k = 2", "k = 2\nduration = inf", "scenario 'small'", ["duration must be positive and finite; got inf"]),
     ("k = 2", "k = 1", "k", ["got 1, expected at least 2"]),
     ("k = 2", "k = 2.0", "k", ["got 2.0, expected an integer"]),
-    ("k = 2", "k = 2\norder = 3", "order", ["got 3, expected 1 or 2"]),
+    ("k = 2", "k = 2\norder = 4", "order", ["got 4, expected 1, 2 or 3"]),
     ("k = 2", "k = 2\nfigure_agent = 'a'", "figure_agent", ["expected an integer"]),
     ("k = 2", 'k = 2\ndesign_rule = "blunt"', "design_rule", ["got 'blunt', expected \"paper\" or \"sharp\""]),
     ("k = 2", "k = 2\nduraton = 3", "duraton", ["did you mean 'duration'?"]),

@@ -189,7 +189,7 @@ def test_sizing_starts_the_bounds_a_margin_above_the_smallest_feasible():
             {"observers": (TargetObservers(drift="no"),) * 8},
             "the drift of its observers must be True or False; got 'no'",
         ),
-        ({"order": 3}, "order must be 1 or 2; got 3"),
+        ({"order": 4}, "order must be 1, 2 or 3; got 4"),
         ({"figure_agent": 8}, "figure_agent must be None or an agent's index from 0 to 7; got 8"),
         ({"figure_agent": True}, "figure_agent must be None or an agent's index from 0 to 7; got True"),
         ({"name": "../../x"}, "name is also a folder's: 1 to 200 characters without '/'; got '../../x'"),

@@ -35,14 +35,13 @@ def trajectory(integrator, dt, times):
 
 @pytest.fixture(scope="module")
 def reference():
-    """Order 2 at 1e-4 s: a hundredth of the error at 1e-3 s."""
-    return trajectory(Proximal(2), 1e-4, np.arange(1, 11) * 0.1)
+    """Order 3 at 2e-4 s: a hundredth of its error at 1e-3 s."""
+    return trajectory(Proximal(3), 2e-4, np.arange(1, 11) * 0.1)
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [1, 2, 3])
 def test_order_of_convergence(order, reference):
-    """ARS(1,1,1) and ARS(2,2,2) (Ascher et al., 1997) converge with their order, in states, estimates and input
-    estimates.
+    """The schemes of Ascher et al. (1997) converge with their order, in states, estimates and input estimates.
 
     The largest error over ten instants of the first second, the paper's closed loop with disturbances, dt 1e-3 to
     1e-2.
@@ -54,7 +53,8 @@ def test_order_of_convergence(order, reference):
     slopes = [np.polyfit(np.log(STEPS), np.log(row), 1)[0] for row in errors]
     for name, slope, row in zip(("x", "estimates", "input estimates"), slopes, errors, strict=True):
         print(f"order {order}, {name}: slope {slope:.3f}, error {row[-1]:.1e} at 1e-3 s, {row[0]:.1e} at 1e-2 s")
-    assert slopes == pytest.approx([order] * 3, abs=0.25)
+    lowest = 2.3 if order == 3 else order - 0.25  # in a stiff problem the inner stages of ARS(4,4,3) are of order 1
+    assert all(lowest < slope < order + 0.25 for slope in slopes)
 
 
 @pytest.mark.parametrize(

@@ -139,8 +139,8 @@ def test_what_a_simulator_is_built_from_is_checked():
         Simulator(design, initial, task=nx.path_graph(3), observe="truth")
     with pytest.raises(DesignError, match=r"take delta\(0\) above 200"):
         Simulator(design, InitialSet(np.zeros(6), np.full(6, 200.0)))
-    with pytest.raises(ValueError, match="order 1 and 2; got order=3"):
-        Proximal(order=3)
+    with pytest.raises(ValueError, match="order 1, 2 and 3; got order=4"):
+        Proximal(order=4)
     for threads in (0, 10**6, 2.5, True):
         with pytest.raises(ValueError, match=f"threads must be an integer from 1 to 256; got {threads}"):
             Proximal(threads=threads)
