@@ -208,6 +208,37 @@ def test_inputs_are_held_from_call_to_call():
             assert np.abs(getattr(simulator, name) - getattr(exact, name)).max() < 1e-3, name
 
 
+def jumping() -> Simulator:
+    """The paper's agents without a law, at rest in their funnels; inputs are held."""
+    simulator = paper().build(observers=Proximal(3)).reset(1)
+    for _ in range(100):
+        simulator.step(0.01, np.zeros(simulator.fleet.m))
+    return simulator
+
+
+def test_a_jump_is_passed_in_few_steps():
+    """Of inputs, to which input observers settle within 0.1 ms: the filter knows that their error dies out."""
+    simulator = jumping()
+    calm = simulator.advance(1.2, tolerance=1e-3, u=np.zeros(16))
+    jumped = simulator.advance(1.4, tolerance=1e-3, u=np.full(16, 1.0))
+    print(calm, jumped)
+    assert sum(jumped) < sum(calm) + 12
+
+
+def test_extremes_are_those_of_accepted_steps():
+    """Though steps that are taken back raise them for a moment."""
+    simulator = jumping()
+    simulator.restore(simulator.save())
+    control, own = StepControl(simulator, 1e-4), simulator.extremes
+    simulator.hold(np.full((16, 1), 2.0))
+    while simulator.t[0] < 1.2 - 1e-12:
+        control.step(1.2)
+        simulator.observers.raise_extremes(simulator.state, own)
+    assert control.rejected > 0
+    for ours, theirs in zip(own, simulator.extremes, strict=True):
+        assert np.array_equal(ours, theirs)
+
+
 def test_the_largest_error_of_the_batch_decides():
     """Every environment is as accurate as alone; the same call gives the same bits."""
     chosen = paper()
