@@ -138,7 +138,7 @@ def deploy(
             assert played is not None
             parts, policies = steps_of(played, period), policy_setups(played, seed)
         else:
-            steps = {"--dt": period, "--order": None, "--integrator": None}
+            steps = {"--dt": period, "--order": None, "--integrator": None, "--tolerance": None}
             episode = continuous(chosen, controller, "estimate", duration, steps, seed, over)
             parts = steps_per_round(episode, period, dt)
         episode.dt = period / parts

@@ -95,14 +95,14 @@ class Relay:
         """Nothing to do."""
 
     def predict(self, memory: Memory, t: FloatArray, dt: float, part: Range | None = None) -> None:
-        """Nothing to do."""
+        """Nothing to do: no estimates of its own in `memory` move from `t` by `dt`, in any `part`."""
 
     def message(self, state: PlantState) -> list[FloatArray]:
         """Nothing more."""
         return []
 
     def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
-        """Nothing to do."""
+        """Nothing to `take` from messages of its own, in whatever `part` is `due`; `state` stays as it is."""
 
     def raise_extremes(self, state: PlantState, extremes: Extremes, part: Range | None = None) -> None:
         """No ratios."""

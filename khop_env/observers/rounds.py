@@ -129,7 +129,14 @@ class Rounds:
         memory["ppso.held"][:, env_ids] = first_guess[self._states.source][:, None]
 
     def predict(self, memory: Memory, t: FloatArray, dt: float, part: Range | None = None) -> None:
-        """Y += dt (f(y) + g_hat), explicit Euler as in the proximal step of order 1."""
+        """Y += dt (f(y) + g_hat), explicit Euler as in the proximal step of order 1.
+
+        Args:
+            memory: whose estimates move.
+            t: (B,) times at the beginning in s.
+            dt: in s.
+            part: the range of environments; None for all.
+        """
         low, high = part or self._all
         estimate = memory["ppso.estimate"]
         self._drifts.evaluate(estimate, t[low:high, None], self._rate, (low, high))
@@ -143,7 +150,14 @@ class Rounds:
         return [state.g, *(memory[name] for name in _SENT)]
 
     def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
-        """Hold what has come, and solve in the environments that are `due`."""
+        """Hold what has come, and solve in the environments that are `due`.
+
+        Args:
+            state: at the time of the round.
+            take: fetches values of messages.
+            due: (B,) environments in which there is a round.
+            part: the range of environments; None for all.
+        """
         memory, design, (low, high) = state.memory, self._design, part or self._all
         take(self._input_link, self._input_row, memory["ppso.neighbor_input"])
         for held, funnels, widths, names in (
