@@ -198,7 +198,9 @@ def _best(action: Callable[[], object], repeats: int) -> float:
 
 
 def _simulator(scenario: Scenario, batch: int, order: int = 2) -> Simulator:
-    return scenario.build(law=make_law(scenario.law), observers=Proximal(order), num_envs=batch)
+    simulator = scenario.build(law=make_law(scenario.law), observers=Proximal(order), num_envs=batch)
+    simulator.warm_up(long=True)
+    return simulator
 
 
 def _run(

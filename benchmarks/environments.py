@@ -26,6 +26,7 @@ Rate = Callable[[float], float]
 def single(scenario: str, order: int) -> tuple[KHopEnv, Callable[[int], None]]:
     """One `consensus_v0.parallel_env`, and a step with random actions that resets it after 200."""
     env = consensus_v0.parallel_env(scenario, order=order)
+    env.batched.simulator.warm_up(long=True)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     pool = [{agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.possible_agents} for _ in range(64)]
@@ -49,6 +50,7 @@ def batched(
 ) -> tuple[BatchedEnv, Callable[[int], None]]:
     """A batched environment and a step with random actions that resets finished environments."""
     env = make_batched(environment, scenario, num_envs=batch, order=order, threads=threads, **arguments)
+    env.simulator.warm_up(long=True)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     shape = batch, len(env.agents), 2
@@ -69,17 +71,21 @@ def vector_rate(seconds: float, scenario: str, order: int, threads: int, batch: 
 
 
 def shares(env: BatchedEnv, step: Callable[[int], None], steps: int) -> dict[str, float]:
-    """Microseconds per environment and step in each part of `step`, which steps `env`."""
+    """Microseconds per environment and step in each part of `step`, which steps `env`.
+
+    The parts of a compiled step can't be told apart, so that these are of the same loops called from Python.
+    """
+    simulator: Any = env.simulator
+    simulator._compiled = None
     for number in range(5):
         step(number)
-    simulator: Any = env.simulator
     observers = simulator.observers
     spent: dict[str, float] = {}
     for name, holder, attributes in (
         ("solve", observers, ("_solve_states", "_solve_inputs")),
-        ("right-hand sides", simulator.plant, ("rate", "actuate")),
+        ("right-hand sides", simulator.plant, ("stage", "actuate")),
         ("right-hand sides", observers.prediction, ("rate",)),
-        ("observation", env, ("_read_observations",)),
+        ("observation", env._read_observations, ("write",)),
     ):
         for attribute in attributes:
             setattr(holder, attribute, _timed(getattr(holder, attribute), name, spent))

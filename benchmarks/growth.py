@@ -40,6 +40,10 @@ def _simulator(scenario: Scenario) -> Simulator:
     return scenario.build(law=make_law(scenario.law), observers=Proximal(2))
 
 
+def _simulator_in(subject: Simulator | BatchedEnv) -> Simulator:
+    return subject if isinstance(subject, Simulator) else subject.simulator
+
+
 def _step(env: BatchedEnv) -> object:
     if env.over.any():
         env.reset(seed=0)
@@ -68,6 +72,7 @@ def growth_rows(add: Callable[..., None], quick: bool, say: Callable[[str], None
 def _growth_of(kind: _Kind, sizes: tuple[int, ...], add: Callable[..., None], rounds: int) -> None:
     small = random_geometric(agents=30)
     compiled = kind.make(small)  # and all that every environment shares
+    _simulator_in(compiled).warm_up(long=True)
     kind.step(compiled)
     made, pairs, held, making = [], [], [], 0.0
     for agents in sizes:
@@ -76,8 +81,7 @@ def _growth_of(kind: _Kind, sizes: tuple[int, ...], add: Callable[..., None], ro
         subject = kind.make(scenario)
         making = time.perf_counter() - start
         results = kind.step(subject)
-        simulator = subject if isinstance(subject, Simulator) else subject.simulator
-        pairs.append(simulator.observers.layout.pairs)
+        pairs.append(_simulator_in(subject).observers.layout.pairs)
         held.append(held_memory([subject, results], besides=[scenario, small, compiled]))
         made.append(subject)
     seconds = np.full(len(sizes), np.inf)

@@ -29,7 +29,17 @@ from khop_env.physics.waveforms import disturb
 from khop_env.registry import scenario
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Simulator, StepControl
-from khop_env.simulation.compiled_step import Values, Work, predict, unpacked
+from khop_env.simulation.compiled_step import (
+    Values,
+    Work,
+    edges_at,
+    floats_at,
+    integers_at,
+    pairs_at,
+    predict,
+    runs_at,
+    terms_at,
+)
 from khop_env.simulation.edge_law import command_inputs
 
 DURATION = 10.0  # s
@@ -50,25 +60,25 @@ def closed_loop(
     integers: Any, floats: FloatArray, law: Any, now: Any, drawn: FloatArray, work: Any, rates: Any, xi: Any, e: Any
 ) -> None:
     """Write the rates of x, x_hat and g_hat of one environment into `rates`; `now` are `Values`, `work` is `Work`."""
-    system, now, work = unpacked(integers, floats), Values(*now), Work(*work)
+    n, f, now, work = integers, floats, Values(*now), Work(*work)
     dx, dy, dghat = rates
-    states, inputs = PairArrays(*system.states), PairArrays(*system.inputs)
-    command_inputs(
-        law, system.edges, system.runs, now.x, now.estimate, now.u, work.terms, work.velocity, work.drift, 0, 1
-    )
-    input_maps(system.runs, now.x, now.u, now.g, 0, 1)
-    drifts(system.runs, now.x, dx, 0, 1)
-    if system.terms[0].size:
-        disturb(system.terms, now.t, now.x, drawn, work.w, 0, 1)
+    sizes = integers_at(n, 48)
+    runs, terms, edges = runs_at(n, f, 0, 0), terms_at(n, f, sizes[0]), edges_at(n, f, sizes[0])
+    states, inputs = PairArrays(*pairs_at(n, f, 27, 6)), PairArrays(*pairs_at(n, f, 37, 8))
+    command_inputs(law, edges, runs, now.x, now.estimate, now.u, work.terms, work.velocity, work.drift, 0, 1)
+    input_maps(runs, now.x, now.u, now.g, 0, 1)
+    drifts(runs, now.x, dx, 0, 1)
+    if terms[0].size:
+        disturb(terms, now.t, now.x, drawn, work.w, 0, 1)
     for row in range(dx.shape[0]):
         dx[row, 0] += now.g[row, 0] + work.w[row, 0]
-    exponentials(now.t, system.rho[0], system.rho[1], system.rho[2], work.rho, 0, 1)
+    exponentials(now.t, floats_at(n, f, 10), floats_at(n, f, 11), floats_at(n, f, 12), work.rho, 0, 1)
     disagreement(states, now.estimate, now.x, xi[0])
     correction(states, xi[0], work.rho, e[0], dy)
-    predict(system, now, xi[0], 0, 1)
+    predict(runs_at(n, f, 7, 1), sizes[1] > 0, integers_at(n, 47), now.estimate, now.input_estimate, xi[0], 0, 1)
     for row in range(dy.shape[0]):
         dy[row, 0] += xi[0][row, 0]
-    exponentials(now.t, system.omega[0], system.omega[1], system.omega[2], work.omega, 0, 1)
+    exponentials(now.t, floats_at(n, f, 13), floats_at(n, f, 14), floats_at(n, f, 15), work.omega, 0, 1)
     disagreement(inputs, now.input_estimate, now.g, xi[1])
     correction(inputs, xi[1], work.omega, e[1], dghat)
 
@@ -145,7 +155,6 @@ class Problem:
     def controlled(self, tolerance: float, order: int = 3) -> Run:
         """Steps of controlled size, with the states inside them."""
         simulator = simulator_of(self.scenario, order)
-        simulator.warm_up()
         StepControl(simulator, tolerance).warm_up()
         start, out = simulator.save(), np.zeros((simulator.fleet.n, len(self.times)))
 
@@ -204,7 +213,9 @@ class Problem:
 
 def simulator_of(chosen: Scenario, order: int, batch: int = 1) -> Simulator:
     """A closed loop, reset with seed 0."""
-    return chosen.build(law=make_law(chosen.law), observers=Proximal(order), num_envs=batch)
+    simulator = chosen.build(law=make_law(chosen.law), observers=Proximal(order), num_envs=batch)
+    simulator.warm_up(long=True)
+    return simulator
 
 
 def cubic(dt: float, values: FloatArray, times: Any) -> FloatArray:

@@ -121,7 +121,7 @@ def _case(simulator: Simulator, dt: float, factor: float, rng: np.random.Generat
     found = 0
     for step in range(_STEPS + 1):
         if step:
-            simulator.step(dt)
+            simulator.step(dt, u.T)
         error = simulator.errors().T
         bound = factor * simulator.error_bounds().bound
         found += violations(np.abs(error), bound, simulator.state.x, layout)
@@ -129,7 +129,6 @@ def _case(simulator: Simulator, dt: float, factor: float, rng: np.random.Generat
         u = np.where(switched, -u, u)
         if step % 5 == 0:
             u = np.where(kind == 2, _away(simulator, error, observer_of, u), u)
-        simulator.hold(u)
     return found, float(simulator.extremes.relative.max())
 
 

@@ -36,7 +36,7 @@ except ImportError:  # kernels then run as plain Python: slow, but enough for on
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Marks of files whose text kernels depend on; compiled code knows the fields of a named tuple by position only.
-_MARKS = (b"@compiled", b"@inlined", b"NamedTuple")
+_MARKS = (b"@compiled", b"@inlined", b"@pasted", b"NamedTuple")
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -60,7 +60,32 @@ def inlined(function: F) -> F:
     return _cached(function, forceinline=True)
 
 
-def _cached(function: F, **options: bool) -> F:
+def pasted(function: F) -> F:
+    """Like `inlined`, but by Numba: for a line or two that are called with many constants.
+
+    `inlined` would compile a copy for each constant, before LLVM pastes it.
+    """
+    return _cached(function, inline="always")
+
+
+def available(kernel: Any, *arguments: Any) -> bool:
+    """Whether a kernel is compiled for arguments of these types: in this process, or by an earlier one on disk.
+
+    False, too, where this can't be found out.
+    """
+    with suppress(AttributeError):  # Python functions; a Numba that has other names for these
+        types = tuple(kernel.typeof_pyval(argument) for argument in arguments)
+        if types in kernel.overloads:
+            return True
+        found = kernel._cache.stored(types, kernel.targetctx)
+        if found is not None:
+            kernel.targetctx.insert_user_function(found.entry_point, found.fndesc, [found.library])
+            kernel.add_overload(found)
+            return True
+    return False
+
+
+def _cached(function: F, **options: Any) -> F:
     if numba is None:
         return function
     compile_with = functools.partial(numba.njit, nogil=True, error_model="numpy", **options)
@@ -147,11 +172,15 @@ class _Cache:
             self.cache_path = numba_cache.cache_path
             numba_cache._cache_file = _Files(Path(numba_cache.cache_path), function)
 
-    def load_overload(self, *arguments: Any) -> Any:
-        found = None
+    def stored(self, *arguments: Any) -> Any:
+        """What `load_overload` loads, without an announcement where there is nothing."""
         if self._numba is not None:
             with suppress(Exception):  # for any damage of a file
-                found = self._numba.load_overload(*arguments)
+                return self._numba.load_overload(*arguments)
+        return None
+
+    def load_overload(self, *arguments: Any) -> Any:
+        found = self.stored(*arguments)
         if found is None:
             _announce(kept=self._numba is not None)
         return found

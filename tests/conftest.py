@@ -53,6 +53,7 @@ SLOW = tuple(
         "env/test_integrations.py::TestNames::test_import",
         "env/test_windows.py::test_without_a_display",
         "tasks/test_navigation.py::test_the_contract_is_kept",
+        "observers/test_networked_threads.py::test_threads_and_batches_leave_every_bit",
         "observers/test_node.py::test_it_runs_without_numba",
         "results/test_figures.py::test_pyplot_is_left_alone",
         "test_cli.py::TestRun",

@@ -203,11 +203,11 @@ def test_a_change_in_another_file_is_seen(tmp_path):
 
 
 def kernels(tree: ast.Module) -> Iterator[ast.FunctionDef]:
-    """Functions below one of the two decorators."""
+    """Functions below one of the decorators."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef):
             names = {decorator.id for decorator in node.decorator_list if isinstance(decorator, ast.Name)}
-            if names & {"compiled", "inlined"}:
+            if names & {"compiled", "inlined", "pasted"}:
                 yield node
 
 
@@ -235,7 +235,7 @@ def test_kernels_take_no_constant_from_files_that_entries_do_not_depend_on():
     assert seen > 30
 
 
-@pytest.mark.parametrize("function", [module.compiled, module.inlined])
+@pytest.mark.parametrize("function", [module.compiled, module.inlined, module.pasted])
 def test_division_by_zero_is_ieee(function):
     @module.compiled
     def divide(a, b):

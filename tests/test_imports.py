@@ -49,7 +49,7 @@ HEAVY = {
     "torch": ("agents", "benchmarks.peers"),  # the peers run in environments of their own
     "ray": ("agents",),
     "stable_baselines3": ("agents", "khop_env.env.sb3", "khop_env.testing.libraries", "benchmarks.peers"),
-    "matplotlib": ("khop_env.results", "khop_env.env.rendering", "benchmarks.safety_film"),
+    "matplotlib": ("khop_env.results", "khop_env.env.rendering", "benchmarks.safety_film", "benchmarks.precision"),
     "pygame": ("khop_env.env.rendering",),
     "imageio_ffmpeg": ("khop_env.results",),
 }

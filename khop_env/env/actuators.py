@@ -13,10 +13,9 @@ from typing import Protocol
 
 import numpy as np
 
+from khop_env.env.period import DIRECT, HOLD, LAG, OTHER, SLEW
 from khop_env.observers import FloatArray
 from khop_env.physics import did_you_mean
-
-OTHER, DIRECT, LAG, SLEW, HOLD = range(5)  # of `period.actuate`
 
 
 class Actuator(Protocol):

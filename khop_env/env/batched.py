@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from khop_env.brief import spread
 from khop_env.env.actions import ActionReader
-from khop_env.env.actuators import OTHER, compiled_form
+from khop_env.env.actuators import compiled_form
 from khop_env.env.columns import ObservationColumns, global_state
 from khop_env.env.layout import Float32Array, ObservationLayout
 from khop_env.env.options import completed, seeds
-from khop_env.env.period import actuate, as_fractions, end_period, larger_for_all
+from khop_env.env.period import OTHER, actuate, as_fractions, end_period, larger_for_all
 from khop_env.env.readout import Sources, summarize
 from khop_env.env.settings import Settings
 from khop_env.env.state import EnvState, Infos, Step, signature
@@ -297,8 +297,7 @@ class BatchedEnv:
         if self._driven.size:
             self.task.drive(self.world, physical)
             as_fractions(self._driven, physical, self._limit, inputs)
-        self.simulator.hold(physical)
-        self.simulator.step_unchecked(self._dt, self._parts)
+        self.simulator.step_unchecked(self._dt, self._parts, physical)
         self.task.moved(self.world, number)
 
     def _evaluate(self) -> Outcome:

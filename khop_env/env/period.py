@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from khop_env.compiled import compiled
-from khop_env.env.actuators import DIRECT, HOLD, LAG, SLEW
-from khop_env.observers import Extremes, FloatArray, IntArray
+from khop_env.observers import FloatArray, IntArray
+from khop_env.observers.base import Extremes
+
+OTHER, DIRECT, LAG, SLEW, HOLD = range(5)  # kinds of actuators
 
 
 @compiled

@@ -77,6 +77,7 @@ def run_round(
     bits = WORD * lost.shape[0]
     of_round = np.empty(width, np.uint64)
     after_delivery, after_loss, latency = np.empty(width), np.empty(width), np.empty(width)
+    soonest, latest = np.empty(width, np.int64), np.empty(width, np.int64)
     for e in range(width):
         b = place(low + e)
         if due[b]:
@@ -88,6 +89,7 @@ def run_round(
         if rules.recovery > 0.0:
             after_delivery[e], after_loss[e] = rules.recovery * loss / (1.0 - loss), 1.0 - rules.recovery
         of_round[e] = round_key(key[b], number[b])
+        soonest[e], latest[e] = _rounds_late(rules, latency[e], 0.0), _rounds_late(rules, latency[e], 1.0)
     for link in range(links):
         for e in range(width):
             b = place(low + e)
@@ -102,13 +104,11 @@ def run_round(
                 lost[word, link, b] |= bit
             else:
                 lost[word, link, b] &= ~bit
-            soonest = _rounds_late(rules, latency[e], 0.0)
-            latest = _rounds_late(rules, latency[e], 1.0)
-            for age in range(soonest, min(latest, now - newest[link, b] - 1) + 1):
+            for age in range(soonest[e], min(latest[e], now - newest[link, b] - 1) + 1):
                 sent = now - age
                 if (lost[sent % bits // WORD, link, b] >> np.uint64(sent % WORD)) & np.uint64(1):
                     continue
-                if latest > soonest:
+                if latest[e] > soonest[e]:
                     u = uniform(round_key(key[b], sent), link, DELAY)
                     if _rounds_late(rules, latency[e], u) > age:
                         continue

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.physics import AgentModel, read_only
+from khop_env.physics.right_hand_sides import Runs, drifts
 from khop_env.threads import Range
 
 
@@ -17,12 +18,12 @@ class Drift(NamedTuple):
 
     Attributes:
         model: of the target.
-        function: of times and states, as `AgentModel.drift`.
+        function: of times and states, as `AgentModel.drift`; None for the model's own.
         region: the operating region outside which it isn't the model's, as bytes.
     """
 
     model: AgentModel
-    function: Callable[[FloatArray, FloatArray], FloatArray]
+    function: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     region: bytes = b""
 
 
@@ -45,21 +46,25 @@ class Drifts:
 
     Attributes:
         divisible: whether ranges of environments may be evaluated one by one, in several threads at once: the library's
-            models work element by element, and others may have been written for one caller and a whole batch.
+            models work element by element; others may have been written for one caller and a whole batch.
     """
 
     def __init__(self, layout: PairLayout, drifts: Sequence[Drift | None], num_envs: int) -> None:
         self._all = 0, num_envs
-        self._runs: list[_Run] = []
+        runs: list[_Run] = []
         for block, drift in zip(layout.blocks, drifts, strict=True):
             if drift is None:
                 continue
-            columns, pairs, last = block.columns, block.pairs, self._runs[-1] if self._runs else None
+            columns, pairs, last = block.columns, block.pairs, runs[-1] if runs else None
             if last is not None and last.columns.stop == columns.start and _equal(last.drift, drift):
-                self._runs.pop()
+                runs.pop()
                 columns, pairs = slice(last.columns.start, columns.stop), slice(last.pairs.start, pairs.stop)
-            self._runs.append(_Run(drift, columns, pairs, block.components))
-        self.divisible = all(type(run.drift.model).__module__.startswith("khop_env.") for run in self._runs)
+            runs.append(_Run(drift, columns, pairs, block.components))
+        self.divisible = all(run.drift.model.form is not None for run in runs)
+        in_kernel = [run for run in runs if run.drift.function is None and run.drift.model.form is not None]
+        self._in_python = [run for run in runs if run not in in_kernel]
+        parts = [(run.drift.model, run.pairs.stop - run.pairs.start, run.columns.start, 0) for run in in_kernel]
+        self._in_kernel: Any = tuple(Runs.of(parts)) if parts else None
 
     def evaluate(self, p: FloatArray, t: FloatArray, out: FloatArray, part: Range) -> None:
         """Write the drifts at estimates `p` (P, B) into `out` (P, B), in a range of environments.
@@ -71,12 +76,13 @@ class Drifts:
             part: the range.
         """
         low, high = part
-        for drift, columns, pairs, components in self._runs:
-            # contiguous, as in a whole batch
+        if self._in_kernel is not None:
+            drifts(self._in_kernel, p, out, low, high)
+        for (model, function, _), columns, pairs, components in self._in_python:
             values = p[columns] if part == self._all else np.ascontiguousarray(p[columns, low:high])
             states = read_only(values.T.reshape(high - low, pairs.stop - pairs.start, components))
             times = read_only(t[:] if t.shape[1] == 1 else t[:, pairs])
-            out[columns, low:high] = drift.function(times, states).reshape(high - low, -1).T
+            out[columns, low:high] = (function or model.drift)(times, states).reshape(high - low, -1).T
 
 
 def _equal(first: Drift, second: Drift) -> bool:

@@ -28,7 +28,7 @@ from khop_env.observers.merging import Sources, largest_share
 from khop_env.observers.proximal import MOST_THREADS
 from khop_env.observers.reckoning import Reckoning, certificates_of
 from khop_env.observers.solve import LANES
-from khop_env.observers.steps import Plan, Step
+from khop_env.observers.steps import Plan, Step, note_length
 from khop_env.physics import hops_from_targets
 from khop_env.threads import Range, Threads
 
@@ -162,9 +162,7 @@ class Networked:
         plant.effect(state)
         channel = self._exchange.of_channel(memory)
         due = self.channel.due(channel, state.t)
-        changed = np.abs(memory["step"] - dt) > 1e-9 * dt
-        np.copyto(memory["even_since"], before.t, where=changed)
-        memory["step"].fill(dt)
+        note_length(dt, before.t, memory["step"], memory["even_since"])
         self._carry_out(self._whole_step, Step(state, channel, due, self.links_up(state), before.t, dt))
         plant.actuate(state)
 

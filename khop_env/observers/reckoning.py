@@ -52,7 +52,8 @@ class Reckoning:
             model, growth, n = certificate.model, certificate.growth, block.components
             matrices.append(np.zeros((n, n)) if growth is None else growth.matrix)
             still = growth is not None and not growth.matrix.any() and not growth.spread.any()
-            function = extended_drift(model, growth)
+            extended = extended_drift(model, growth)
+            function = None if extended == model.drift else extended
             drifts.append(None if still else Drift(model, function, certificate.region.tobytes()))
         self._drifts = Drifts(layout, drifts, num_envs)
         self.divisible = self._drifts.divisible

@@ -27,6 +27,10 @@ from khop_env.observers.layout import FloatArray, IntArray, PairLayout
 from khop_env.observers.scalar import solve_alone
 from khop_env.threads import Range
 
+_OF_STATES = "ppso.held", "ppso.eps", "ppso.estimate", "ppso.normalized"
+_OF_INPUTS = "ppso.input_held", "ppso.input_eps", "ppso.input_estimate", "ppso.input_normalized"
+_SENT = "ppso.estimate", "ppso.input_estimate", "ppso.neighbor_input"
+
 
 class _Held(NamedTuple):
     """What the observers of one layout hold of others' messages, each value in the place of (pair, source, component).
@@ -93,10 +97,7 @@ class Rounds:
         self._states = _held(states, estimate, 1, known)
         self._inputs = _held(inputs, input_estimate, own_input, heard)
         self._rho, self._omega = np.ones((states.rows, num_envs)), np.ones((inputs.rows, num_envs))
-        known_drifts = [
-            Drift(fleet.models[i], fleet.models[i].drift) if design.options[i].drift else None
-            for i in states.target.tolist()
-        ]
+        known_drifts = [Drift(fleet.models[i]) if design.options[i].drift else None for i in states.target.tolist()]
         self._drifts = Drifts(states, known_drifts, num_envs)
         self.divisible = self._drifts.divisible
         self._rate = np.zeros((states.size, num_envs))
@@ -139,33 +140,23 @@ class Rounds:
         memory = state.memory
         self._design.states.rho.evaluate(state.t, self._rho)  # for `receive`
         self._design.inputs.rho.evaluate(state.t, self._omega)
-        return [state.g, *(memory[f"ppso.{name}"] for name in ("estimate", "input_estimate", "neighbor_input"))]
+        return [state.g, *(memory[name] for name in _SENT)]
 
     def receive(self, state: PlantState, take: Take, due: NDArray[np.bool_], part: Range | None = None) -> None:
         """Hold what has come, and solve in the environments that are `due`."""
         memory, design, (low, high) = state.memory, self._design, part or self._all
         take(self._input_link, self._input_row, memory["ppso.neighbor_input"])
-        for held, funnels, widths, name in (
-            (self._states, design.states, self._rho, ""),
-            (self._inputs, design.inputs, self._omega, "input_"),
+        for held, funnels, widths, names in (
+            (self._states, design.states, self._rho, _OF_STATES),
+            (self._inputs, design.inputs, self._omega, _OF_INPUTS),
         ):
             if not funnels.layout.size:
                 continue
-            values = memory[f"ppso.{name}held"]
+            values, eps, estimate, normalized = (memory[name] for name in names)
             take(held.link, held.row, values)
+            packed, period = funnels.layout.packed, self._period
             solve_alone(
-                funnels.layout.packed,
-                held.start,
-                held.offset,
-                self._period,
-                values,
-                widths,
-                due,
-                memory[f"ppso.{name}eps"],
-                memory[f"ppso.{name}estimate"],
-                memory[f"ppso.{name}normalized"],
-                low,
-                high,
+                packed, held.start, held.offset, period, values, widths, due, eps, estimate, normalized, low, high
             )
         memory["input_estimate"][:, low:high] = memory["ppso.input_estimate"][:, low:high]
 

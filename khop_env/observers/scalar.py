@@ -7,17 +7,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.compiled import compiled, inlined, place
+from khop_env.compiled import compiled, place
 from khop_env.elementary import expm1
 from khop_env.observers.barrier import barrier, eps_near_impulse
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays
+from khop_env.observers.single import solve_in_single_precision
 from khop_env.observers.solve import LANES
 
-_FEW, _MANY = 8, 100  # iterations from a warm start; between bounds, where bisection alone would take 60
-_SMALL = 1e-6  # in eps: the error after such a step of Newton's method is its square
+_FEW, _MANY = 8, 100  # iterations from a start; between bounds, where bisection alone would take 60
+_SMALL = 1e-5  # in eps: the error after such a step of Halley's method is its cube
 _EXACT = 4e-16
 _LONGEST = 4.0
-_JUMP = 0.5  # in eps: beyond it a warm start is no better than a new start
+_LARGEST = 60.0  # eps that single precision can still find
 
 
 @compiled
@@ -47,7 +48,7 @@ def solve_alone(
         held: (C, B) what was received last.
         rho: (rows, B) the funnels.
         due: (B,) environments in which to solve; the others keep every bit.
-        eps: (P, B) T(e); the last one on entry, the new one on return.
+        eps: (P, B) T(e); a start on entry, used where single precision overflows; the new one on return.
         estimate: (P, B) y* on entry, y on return.
         normalized: (P, B) e, written.
         low: first environment.
@@ -58,6 +59,7 @@ def solve_alone(
     target, weight, inverse, total = lanes[0], lanes[1], lanes[2], lanes[3]
     u, active, answer = lanes[4], lanes[5], lanes[6]
     steps, slope, at_u = lanes[7], lanes[8], lanes[9]
+    single = np.empty((3, LANES), np.float32)
     columns, rows, sources = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     last = 0
     for i in range(pairs.observers.size):
@@ -96,6 +98,7 @@ def solve_alone(
                     done += 1
                     if filled < beside and done < last:
                         continue
+                    _start(filled * width, target, weight, u, single)
                     _solve_lanes(filled * width, target, weight, u, active, steps, slope, at_u, answer)
                     for f in range(filled):
                         column_f, row_f, d_f = columns[f], rows[f], float(sources[f])
@@ -109,17 +112,16 @@ def solve_alone(
                     filled = 0
 
 
-@inlined
-def _near(target: float, weight: float) -> float:
-    """The solution for e = z / (4 + |z|), which is near phi's, so that Halley's method needs a few iterations at most.
-
-    At most 4, in 400 000 random equations with b from 1e-6 to 1e6 and s d from 1e-10 to 1e6.
-    """
-    b = abs(target)
-    p = 4.0 * weight + 1.0 - b
-    root = math.sqrt(p * p + 16.0 * weight * b)
-    z = 8.0 * b / (p + root) if p > 0.0 else (root - p) / (2.0 * weight)
-    return eps_near_impulse(math.copysign(z, target))
+@compiled
+def _start(width: int, target: FloatArray, weight: FloatArray, u: FloatArray, single: NDArray[np.float32]) -> None:
+    """Replace warm starts by solutions in single precision; where that overflows, they stay."""
+    b, w, found = single[0], single[1], single[2]
+    for lane in range(width):
+        b[lane], w[lane] = target[lane], weight[lane]
+    solve_in_single_precision(width, b, w, found)
+    for lane in range(width):
+        start = np.float64(found[lane])
+        u[lane] = start if abs(start) < _LARGEST else u[lane]
 
 
 @compiled
@@ -134,10 +136,7 @@ def _solve_lanes(
     normalized: FloatArray,
     answer: FloatArray,
 ) -> None:
-    """Halley's method in eps from warm starts `u`, or near the solution where these are far from it. Writes u and e.
-
-    Where it isn't quick, the solution is found between bounds.
-
+    """Halley's method in eps from starts `u`; where it isn't quick, anew between bounds. Writes u and e.
 
     With q = de/deps = (1 - e^2) / 2 and z = eps / q, the excess F = e + s d z - b and its derivatives, times q, are
 
@@ -145,7 +144,7 @@ def _solve_lanes(
     """
     for lane in range(width):
         active[lane] = 1.0
-    for iteration in range(_FEW):
+    for _ in range(_FEW):
         for lane in range(width):  # arithmetic alone, which runs in vector registers
             eps, sd = u[lane], weight[lane]
             size = abs(eps)
@@ -167,17 +166,10 @@ def _solve_lanes(
             # a lane that has converged stays: its result mustn't depend on the others
             on = active[lane]
             u[lane] -= on * step
-            answer[lane] = normalized[lane] - slope[lane] * step if on > 0.0 else answer[lane]
+            e, q = normalized[lane], slope[lane]
+            answer[lane] = e - q * step * (1.0 + 0.5 * e * step) if on > 0.0 else answer[lane]
             active[lane] = on if abs(step) > _SMALL else 0.0
             moving += active[lane]
-        if iteration == 0:
-            far = 0.0
-            for lane in range(width):
-                far += 1.0 if abs(steps[lane]) > _JUMP else 0.0  # counted: a NaN is a lane's own
-            if far > 0.0:
-                for lane in range(width):
-                    near = _near(target[lane], weight[lane])
-                    u[lane] = near if abs(steps[lane]) > _JUMP else u[lane]
         if moving == 0.0:
             break
     for lane in range(width):

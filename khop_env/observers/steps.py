@@ -11,6 +11,7 @@ from typing import Generic, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from khop_env.compiled import compiled
 from khop_env.observers.base import Memory, PlantState
 from khop_env.observers.layout import FloatArray
 from khop_env.threads import Range, Threads
@@ -43,6 +44,22 @@ class Step:
 
     def __post_init__(self) -> None:
         self.rounds = bool(self.due.any())
+
+
+@compiled
+def note_length(dt: float, before: FloatArray, length: FloatArray, even_since: FloatArray) -> None:
+    """Note that a step of `dt` seconds begins at the times `before` (B,).
+
+    Args:
+        dt: in s.
+        before: in s.
+        length: (B,) of the last step; of this one on return.
+        even_since: (B,) since when steps are equal, in s; changed.
+    """
+    for b in range(length.size):
+        if abs(length[b] - dt) > 1e-9 * dt:
+            even_since[b] = before[b]
+        length[b] = dt
 
 
 Owner = TypeVar("Owner")

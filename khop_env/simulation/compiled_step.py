@@ -11,17 +11,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled, inlined, numba, place
-from khop_env.observers import Extremes, FloatArray, IntArray, Observers, Proximal
+from khop_env.compiled import available, compiled, inlined, numba, pasted, place
+from khop_env.observers import FloatArray, IntArray, Observers, Proximal
+from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
 from khop_env.observers.performance import exponentials
 from khop_env.observers.solve import solve
 from khop_env.physics.right_hand_sides import drifts, input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
-from khop_env.simulation.plant import FleetPlant, advance_plant, combine, require_finite
+from khop_env.simulation.plant import FleetPlant, advance_plant, combine, copy_block, require_finite
 from khop_env.simulation.state import SimulatorState
-from khop_env.threads import Range
 
+PATIENCE = 2000
+"""Steps of a simulator in Python before the compiled step is compiled, where it hasn't been yet."""
 BLOCK = 128  # environments: enough to fill vector registers, few enough for the cache
 _STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
 
@@ -106,19 +108,19 @@ def packed(system: System) -> tuple[IntArray, FloatArray]:
 _INTEGERS, _FLOATS = 49, 18
 
 
-@inlined
+@pasted
 def integers_at(integers: IntArray, q: int) -> IntArray:
     """Array q of the integers of `packed`."""
     return integers[integers[q] : integers[q + 1]]
 
 
-@inlined
+@pasted
 def floats_at(integers: IntArray, floats: FloatArray, q: int) -> FloatArray:
     """Array q of the floats."""
     return floats[integers[_INTEGERS + 1 + q] : integers[_INTEGERS + 2 + q]]
 
 
-@inlined
+@pasted
 def pairs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     """The fields of `PairArrays`, whose first array of integers is q and of floats r."""
     return (
@@ -137,7 +139,7 @@ def pairs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     )
 
 
-@inlined
+@pasted
 def runs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     """The fields of `Runs`, likewise."""
     return (
@@ -152,13 +154,11 @@ def runs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
     )
 
 
-@inlined
-def unpacked(n: IntArray, f: FloatArray) -> Any:
-    """The `System` that was `packed`."""
-    sizes = integers_at(n, 48)
-    dim = sizes[0]
-    positions, own, other = integers_at(n, 19), integers_at(n, 21), integers_at(n, 22)
-    terms = (
+@pasted
+def terms_at(n: IntArray, f: FloatArray, dim: int) -> Any:
+    """The fields of `TermArrays`."""
+    positions = integers_at(n, 19)
+    return (
         integers_at(n, 14),
         integers_at(n, 15),
         floats_at(n, f, 2),
@@ -169,8 +169,13 @@ def unpacked(n: IntArray, f: FloatArray) -> Any:
         floats_at(n, f, 4),
         positions.reshape(positions.size // dim, dim),
     )
-    position = integers_at(n, 26)
-    edges = (
+
+
+@pasted
+def edges_at(n: IntArray, f: FloatArray, dim: int) -> Any:
+    """The fields of `EdgeArrays`."""
+    own, other, position = integers_at(n, 21), integers_at(n, 22), integers_at(n, 26)
+    return (
         integers_at(n, 20),
         own.reshape(own.size // dim, dim),
         other.reshape(other.size // dim, dim),
@@ -179,20 +184,6 @@ def unpacked(n: IntArray, f: FloatArray) -> Any:
         integers_at(n, 25),
         position.reshape(position.size // dim, dim),
         floats_at(n, f, 5),
-    )
-    return System(
-        runs_at(n, f, 0, 0),
-        runs_at(n, f, 7, 1),
-        terms,
-        edges,
-        pairs_at(n, f, 27, 6),
-        pairs_at(n, f, 37, 8),
-        (floats_at(n, f, 10), floats_at(n, f, 11), floats_at(n, f, 12)),
-        (floats_at(n, f, 13), floats_at(n, f, 14), floats_at(n, f, 15)),
-        floats_at(n, f, 16),
-        floats_at(n, f, 17),
-        integers_at(n, 47),
-        sizes,
     )
 
 
@@ -238,6 +229,7 @@ class CompiledStep:
         design, fleet, batch = observers.design, plant.fleet, plant.num_envs
         self._plant, self._observers, self._state = plant, observers, state
         self._ranges = plant.threads.ranges(batch)
+        self._waited = -1  # steps since its code was looked for on disk
         states, inputs, edges = design.states, design.inputs, plant.edges
         runs, input_runs, all_drifts = observers.prediction.compiled_runs()
         self._system = packed(
@@ -268,25 +260,52 @@ class CompiledStep:
         )
         self._arrays = tuple(Values.of(state)), tuple(Values.of(before)), state.drawn, tuple(self._work)
 
-    def __call__(self, dt: float, extremes: Extremes) -> None:
+    def ready(self, extremes: Extremes, now: bool = False) -> bool:
+        """Whether to use it for the next step, of which this is asked once.
+
+        Its code takes longer to compile than short runs take in Python. So it is used from the first step where it has
+        been compiled before, and otherwise compiled after `PATIENCE` steps, or `now`.
+        """
+        if self._waited < 0 and available(step, *self._arguments(1.0, extremes, False), 0, 0):
+            self._waited = PATIENCE
+        self._waited = PATIENCE if now else self._waited + 1
+        return self._waited >= PATIENCE
+
+    def _arguments(self, dt: float, extremes: Extremes, held: bool) -> tuple[Any, ...]:
+        law, scheme = self._plant.edge_law(), self._observers.scheme(dt)
+        return (*self._system, law, *scheme, *self._arrays, tuple(extremes), held)
+
+    def __call__(self, dt: float, extremes: Extremes, held: bool) -> None:
         """Advance by `dt` seconds, and raise the running maxima `extremes`.
+
+        Args:
+            dt: in s.
+            extremes: raised.
+            held: whether inputs are new, so that their effect has to be computed first.
 
         Raises:
             SolveError: if a number isn't finite; the state is undefined then.
         """
+        run: Any = step
+        common = self._arguments(dt, extremes, held)
+        if len(self._ranges) == 1:
+            self._settle(*run(*common, *self._ranges[0]))
+            return
+        for result in self._plant.threads.run(lambda range_: run(*common, *range_), self._ranges):
+            self._settle(*result)
+
+    def _settle(self, failure: int, evaluations: int, env: int, target: int) -> None:
+        """Count the work of a range; raise the error of what failed."""
         observers, state, work = self._observers, self._state, self._work
-        common = (*self._system, self._plant.edge_law(), *observers.scheme(dt), *self._arrays, tuple(extremes))
-
-        def part(range_: Range) -> tuple[int, int, int, int]:
-            return step(*common, *range_)
-
-        for failure, evaluations, env, target in self._plant.threads.run(part, self._ranges):
-            if failure == _STATE:
-                require_finite(state.x, self._plant.fleet)
-            of_inputs = failure == _INPUTS
-            funnels = observers.design.inputs if of_inputs else observers.design.states
-            source, rho = (state.g, work.omega) if of_inputs else (state.x, work.rho)
-            observers.account([(evaluations, env, target)], funnels, source, rho)
+        if not failure:
+            observers.evaluations += evaluations
+            return
+        if failure == _STATE:
+            require_finite(state.x, self._plant.fleet)
+        of_inputs = failure == _INPUTS
+        funnels = observers.design.inputs if of_inputs else observers.design.states
+        source, rho = (state.g, work.omega) if of_inputs else (state.x, work.rho)
+        observers.account([(evaluations, env, target)], funnels, source, rho)
 
 
 def compiled_step(
@@ -319,6 +338,7 @@ def step(
     drawn: FloatArray,
     work: Any,
     extremes: Any,
+    held: bool,
     low: int,
     high: int,
 ) -> tuple[int, int, int, int]:
@@ -336,28 +356,41 @@ def step(
         drawn: (B, K) the disturbance's random numbers.
         work: the fields of `Work`.
         extremes: those of `Extremes`.
+        held: whether the effect of the inputs has to be computed first.
         low: first environment.
         high: one past the last.
 
     Returns:
         What failed, if anything (_STATE, _STATES or _INPUTS), and then as `solve`.
     """
-    system, now, before, work, extremes = (
-        unpacked(integers, floats),
-        Values(*now),
-        Values(*before),
-        Work(*work),
-        Extremes(*extremes),
-    )
-    observed, evaluations = system.inputs[0].size, 0
+    n, f = integers, floats
+    sizes, input_runs = integers_at(n, 48), integers_at(n, 47)
+    runs, estimates = runs_at(n, f, 0, 0), runs_at(n, f, 7, 1)
+    terms, edges = terms_at(n, f, sizes[0]), edges_at(n, f, sizes[0])
+    states, inputs = pairs_at(n, f, 27, 6), pairs_at(n, f, 37, 8)
+    now, before, work, extremes = Values(*now), Values(*before), Work(*work), Extremes(*extremes)
+    observed, evaluations = inputs[0].size, 0
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
-        keep(now, before, begin, end)
+        if held:
+            input_maps(runs, now.x, now.u, now.g, begin, end)
+        for e in range(begin, end):
+            before.t[e] = now.t[e]
+        copy_block(now.x, before.x, begin, end)
+        copy_block(now.u, before.u, begin, end)
+        copy_block(now.g, before.g, begin, end)
+        copy_block(now.estimate, before.estimate, begin, end)
+        copy_block(now.input_estimate, before.input_estimate, begin, end)
+        copy_block(now.eps, before.eps, begin, end)
+        copy_block(now.nu, before.nu, begin, end)
         for s in range(nodes.size):
-            predict(system, now, work.predicted[s], begin, end)
+            tau = implicit[s, s]
+            predict(
+                estimates, sizes[1] > 0, input_runs, now.estimate, now.input_estimate, work.predicted[s], begin, end
+            )
             if not advance_plant(
-                system.runs,
-                system.terms,
+                runs,
+                terms,
                 drawn,
                 s,
                 nodes[s],
@@ -375,117 +408,104 @@ def step(
                 return _STATE, evaluations, -1, -1
             combine(before.estimate, explicit[s], s + 1, work.predicted, now.estimate, begin, end)
             combine(now.estimate, implicit[s], s, work.slopes, now.estimate, begin, end)
-            law_due = law[0] != HELD
-            # the state observers' solve, the law between them, the input observers' solve: one call for both solves,
-            # which is what takes longest to compile
-            for kind in range(2 if observed else 1):
-                if kind == 0:
-                    pairs, estimate, source, widths = system.states, now.estimate, now.x, work.rho
-                    warm, slopes, funnels = now.eps, work.slopes, system.rho
-                else:
-                    if s:
-                        combine(
-                            before.input_estimate, implicit[s], s, work.input_slopes, now.input_estimate, begin, end
-                        )
-                    pairs, estimate, source, widths = system.inputs, now.input_estimate, now.g, work.omega
-                    warm, slopes, funnels = now.nu, work.input_slopes, system.omega
-                exponentials(now.t, funnels[0], funnels[1], funnels[2], widths, begin, end)
+            exponentials(now.t, floats_at(n, f, 10), floats_at(n, f, 11), floats_at(n, f, 12), work.rho, begin, end)
+            count, env, target = solve(
+                states,
+                tau,
+                now.estimate,
+                now.x,
+                work.rho,
+                now.eps,
+                now.estimate,
+                work.slopes[s],
+                (begin, end),
+                (0, states[0].size),
+            )
+            evaluations += count
+            if env >= 0:
+                return _STATES, evaluations, env, target
+            if law[0] != HELD:
+                command_inputs(
+                    law,
+                    edges,
+                    runs,
+                    now.x,
+                    now.estimate,
+                    now.u,
+                    work.terms,
+                    work.velocity,
+                    work.drift,
+                    begin,
+                    end,
+                )
+            input_maps(runs, now.x, now.u, now.g, begin, end)
+            if observed:
+                if s:
+                    combine(before.input_estimate, implicit[s], s, work.input_slopes, now.input_estimate, begin, end)
+                exponentials(
+                    now.t, floats_at(n, f, 13), floats_at(n, f, 14), floats_at(n, f, 15), work.omega, begin, end
+                )
                 count, env, target = solve(
-                    pairs,
-                    implicit[s, s],
-                    estimate,
-                    source,
-                    widths,
-                    warm,
-                    estimate,
-                    slopes[s],
+                    inputs,
+                    tau,
+                    now.input_estimate,
+                    now.g,
+                    work.omega,
+                    now.nu,
+                    now.input_estimate,
+                    work.input_slopes[s],
                     (begin, end),
-                    (0, pairs[0].size),
+                    (0, observed),
                 )
                 evaluations += count
                 if env >= 0:
-                    return (_INPUTS if kind else _STATES), evaluations, env, target
-                if kind == 0:
-                    if law_due:
-                        command_inputs(
-                            law,
-                            system.edges,
-                            system.runs,
-                            now.x,
-                            now.estimate,
-                            now.u,
-                            work.terms,
-                            work.velocity,
-                            work.drift,
-                            begin,
-                            end,
-                        )
-                    input_maps(system.runs, now.x, now.u, now.g, begin, end)
-        raise_block(system, now, work, extremes, begin, end)
+                    return _INPUTS, evaluations, env, target
+        largest_ratios(
+            states,
+            now.estimate,
+            now.x,
+            work.rho,
+            floats_at(n, f, 16),
+            extremes.normalized,
+            extremes.relative,
+            begin,
+            end,
+        )
+        if observed:
+            largest_ratios(
+                inputs,
+                now.input_estimate,
+                now.g,
+                work.omega,
+                floats_at(n, f, 17),
+                extremes.input_normalized,
+                extremes.input_relative,
+                begin,
+                end,
+            )
     return 0, evaluations, -1, -1
 
 
 @inlined
-def keep(now: Any, before: Any, low: int, high: int) -> None:
-    """Copy `Values` of a block."""
-    for e in range(low, high):
-        before.t[e] = now.t[e]
-    copy_block(now.x, before.x, low, high)
-    copy_block(now.u, before.u, low, high)
-    copy_block(now.g, before.g, low, high)
-    copy_block(now.estimate, before.estimate, low, high)
-    copy_block(now.input_estimate, before.input_estimate, low, high)
-    copy_block(now.eps, before.eps, low, high)
-    copy_block(now.nu, before.nu, low, high)
-
-
-@inlined
-def copy_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
-    """Copy the columns low to high - 1."""
-    for row in range(values.shape[0]):
-        for e in range(high - low):
-            out[row, place(low + e)] = values[row, place(low + e)]
-
-
-@inlined
-def predict(system: Any, now: Any, out: FloatArray, low: int, high: int) -> None:
+def predict(
+    runs: Any,
+    all_drifts: bool,
+    input_runs: IntArray,
+    estimate: FloatArray,
+    input_estimate: FloatArray,
+    out: FloatArray,
+    low: int,
+    high: int,
+) -> None:
     """`Prediction.rate`: f(x_hat) + g_hat."""
-    if not system.sizes[1]:
+    if not all_drifts:
         for row in range(out.shape[0]):
             for e in range(high - low):
                 out[row, place(low + e)] = 0.0
-    drifts(system.estimates, now.estimate, out, low, high)
-    count = system.input_runs.size // 3
+    drifts(runs, estimate, out, low, high)
+    count = input_runs.size // 3
     for run in range(count):
-        to, source = system.input_runs[run], system.input_runs[count + run]
-        for q in range(system.input_runs[2 * count + run]):
+        to, source = input_runs[run], input_runs[count + run]
+        for q in range(input_runs[2 * count + run]):
             for e in range(high - low):
-                out[to + q, place(low + e)] += now.input_estimate[source + q, place(low + e)]
-
-
-@inlined
-def raise_block(system: Any, now: Any, work: Any, extremes: Any, low: int, high: int) -> None:
-    """`FunnelObservers.raise_extremes`."""
-    largest_ratios(
-        system.states,
-        now.estimate,
-        now.x,
-        work.rho,
-        system.state_sums,
-        extremes.normalized,
-        extremes.relative,
-        low,
-        high,
-    )
-    if system.inputs[0].size:
-        largest_ratios(
-            system.inputs,
-            now.input_estimate,
-            now.g,
-            work.omega,
-            system.input_sums,
-            extremes.input_normalized,
-            extremes.input_relative,
-            low,
-            high,
-        )
+                out[to + q, place(low + e)] += input_estimate[source + q, place(low + e)]

@@ -234,22 +234,18 @@ def advance_plant(
     Returns:
         Whether all states are finite.
     """
-    rate, width = rates[number], high - low
+    rate = rates[number]
     drifts(runs, x, rate, low, high)
-    for row in range(g.shape[0]):
-        for e in range(width):
-            rate[row, place(low + e)] += g[row, place(low + e)]
+    add_block(g, rate, low, high)
     if terms[0].size:
         disturb(terms, t, x, drawn, w, low, high)
-        for row in range(w.shape[0]):
-            for e in range(width):
-                rate[row, place(low + e)] += w[row, place(low + e)]
+        add_block(w, rate, low, high)
     for e in range(low, high):
         t[e] = t0[e] + elapsed
     combine(x0, weights, number + 1, rates, x, low, high)
     total = 0.0
     for row in range(x.shape[0]):
-        for e in range(width):
+        for e in range(high - low):
             total += 0.0 * x[row, place(low + e)]  # 0, or NaN once and for all
     return total == 0.0
 
@@ -259,12 +255,43 @@ def combine(
     base: FloatArray, weights: FloatArray, count: int, terms: FloatArray, out: FloatArray, low: int, high: int
 ) -> None:
     """Write base + sum of weights[k] terms[k], k below `count`, into the columns low to high - 1 of `out`."""
-    for row in range(base.shape[0]):
-        for e in range(high - low):
-            out[row, place(low + e)] = base[row, place(low + e)]
-        for k in range(count):
+    copy_block(base, out, low, high)
+    for k in range(count):
+        weight, term = weights[k], terms[k]
+        if high - low == out.shape[1]:
+            flat, values = out.ravel(), term.ravel()
+            for q in range(flat.size):
+                flat[q] += weight * values[q]
+        else:
+            for row in range(out.shape[0]):
+                for e in range(high - low):
+                    out[row, place(low + e)] += weight * term[row, place(low + e)]
+
+
+@inlined
+def copy_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
+    """Copy the columns low to high - 1; all of them in one long loop."""
+    if high - low == out.shape[1]:
+        flat, source = out.ravel(), values.ravel()
+        for q in range(flat.size):
+            flat[q] = source[q]
+    else:
+        for row in range(out.shape[0]):
             for e in range(high - low):
-                out[row, place(low + e)] += weights[k] * terms[k, row, place(low + e)]
+                out[row, place(low + e)] = values[row, place(low + e)]
+
+
+@inlined
+def add_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
+    """Add the columns low to high - 1, likewise."""
+    if high - low == out.shape[1]:
+        flat, source = out.ravel(), values.ravel()
+        for q in range(flat.size):
+            flat[q] += source[q]
+    else:
+        for row in range(out.shape[0]):
+            for e in range(high - low):
+                out[row, place(low + e)] += values[row, place(low + e)]
 
 
 def require_finite(x: FloatArray, fleet: Fleet) -> None:

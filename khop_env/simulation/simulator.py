@@ -102,6 +102,7 @@ class Simulator(Readings):
         )
         self.before, self._interrupted = self.state.copy(), False
         self._compiled = compiled_step(self.plant, self.observers, self.state, self.before)
+        self._in_one_call = False
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
         reach = np.abs(initial.center) + initial.radius
         self.longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
@@ -208,15 +209,6 @@ class Simulator(Readings):
         control.run(until)
         return StepCount(control.accepted, control.rejected)
 
-    def hold(self, u: FloatArray) -> None:
-        """Hold inputs from now on, without checks: for callers that have checked them.
-
-        Args:
-            u: (m, B) physical inputs, batch last and finite; the simulator has no law.
-        """
-        self.state.u[...] = u
-        self.plant.actuate(self.state)
-
     def parts_of(self, dt: float) -> int:
         """Number of equal parts into which `step` divides a step, so that the plant's drift is stable in each of them.
 
@@ -226,48 +218,68 @@ class Simulator(Readings):
         parts = parts_of_step(dt, self.longest_step, f"the drift of {self.fleet.ids[self._stiffest]!r}")
         return max(parts, parts_of_step(dt, self.observers.longest_step, "the period of messages"))
 
-    def step_unchecked(self, dt: float, parts: int) -> None:
-        """`step` with the inputs in force, without checks: for callers that have checked the step.
+    def step_unchecked(self, dt: float, parts: int, u: FloatArray | None = None) -> None:
+        """`step` without checks: for callers that have checked the step and the inputs.
 
         Args:
             dt: step in s.
             parts: `parts_of(dt)`.
+            u: (m, B) physical inputs to hold from now on, batch last and finite, where there is no law.
         """
         self._require_whole()
         state, before, copied = self.state, self.before, self.observers.copied
+        self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
+        held = False
+        if u is not None:
+            state.u[...] = u
+            held = self._in_one_call and parts == 1  # the compiled step computes their effect itself
+            if not held:
+                self.plant.actuate(state)
         whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
         start = state.copy() if parts > 1 else before
-        self.keep()
+        self._keep()  # not in the block below: where it is interrupted halfway nothing has to be restored
         try:
             for part in range(parts):
                 if part:
-                    self.keep()
-                self.one_step(dt / parts)
+                    self._keep()
+                self._one_step(dt / parts, held)
         except BaseException as error:
             start.copy_step(state, whole)
             self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
             raise
 
-    def keep(self) -> None:
-        """Make `before` the present state, unless the compiled step does; for callers of `one_step`."""
-        if self._compiled is None:
-            self.state.copy_step(self.before, self.observers.copied)
-
-    def one_step(self, dt: float) -> None:
-        """Advance from `before`, the present state, by a single step of `dt` seconds, and raise the extremes.
+    def try_step(self, dt: float) -> None:
+        """Advance by a single step of `dt` seconds, and raise the extremes. `before` is the state before it.
 
         Raises:
-            FunnelError: as `step`; the state is undefined then, and `before` is as it was.
+            FunnelError: as `step`; the state is undefined then.
             SolveError: likewise.
         """
-        if self._compiled is not None:
-            self._compiled(dt, self.running_extremes)
+        self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
+        self._keep()
+        self._one_step(dt, False)
+
+    def _keep(self) -> None:
+        """Copy the present state to `before`, unless the compiled step does."""
+        if not self._in_one_call:
+            self.state.copy_step(self.before, self.observers.copied)
+
+    def _one_step(self, dt: float, held: bool) -> None:
+        if self._in_one_call:
+            assert self._compiled is not None
+            self._compiled(dt, self.running_extremes, held)
         else:
             self.observers.advance(self.plant, self.before, self.state, dt)
             self.observers.raise_extremes(self.state, self.running_extremes)
 
-    def warm_up(self) -> None:
-        """Compile all code that a step runs; the state is unchanged."""
+    def warm_up(self, long: bool = False) -> None:
+        """Compile all code that the next step runs; the state is unchanged.
+
+        Args:
+            long: whether to compile what only runs of thousands of steps would compile, too.
+        """
+        if long and self._compiled is not None:
+            self._compiled.ready(self.running_extremes, now=True)
         saved, extremes = self.save(), self.running_extremes.copied()
         try:
             self.step_unchecked(_WARM_UP_STEP, 1)

@@ -185,9 +185,8 @@ class StepControl:
 
     def _tried(self, size: float, links: BoolArray | None, most: float) -> float | None:
         """Try a step; the size of a shorter one where it was taken back, None where it is accepted."""
-        self.simulator.keep()
         try:
-            self.simulator.one_step(size)
+            self.simulator.try_step(size)
         except BaseException as failed:
             self._take_back()
             if isinstance(failed, SolveError) and size > _SHORTEST:

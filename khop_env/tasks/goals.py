@@ -11,6 +11,8 @@ from khop_env.compiled import compiled
 from khop_env.observers import FloatArray, IntArray
 from khop_env.tasks.motion import lower_distances
 
+_TILE = 32  # environments whose results are written together
+
 
 class Memory(NamedTuple):
     """`Navigation.memory`, whose arrays the loops take as a plain tuple, which Numba recognises more quickly.
@@ -137,23 +139,28 @@ def evaluate_goals(
     for column in range(input_owner.size):
         for env in range(low, high):
             effort[input_owner[column], env] += inputs[column, env] * inputs[column, env]
-    for env in range(low, high):
-        everybody, collision = True, False
+    collided = np.empty(_TILE, np.bool_)
+    for first in range(low, high, _TILE):
+        last = min(first + _TILE, high)
+        for env in range(first, last):
+            terminated[env], collided[env - first] = True, False
         for i in range(agents):
-            square = 0.0
-            for c in range(dim):
-                gap = memory.goal[i, c, env] - x[positions[i, c], env]
-                square += gap * gap
-            distance = np.sqrt(square)
-            arrived = distance <= goal_radius
-            hit = memory.nearest[i, env] < 2.0 * radius or memory.clearance[i, env] < radius
-            everybody &= arrived
-            collision |= hit
-            value = _distance(memory.goal, memory.before, i, env) - distance - of_effort * effort[i, env]
-            reward[env, i] = value + (bonus * arrived * (1.0 - memory.reached[i, env]) - penalty * hit)
-            error[env, i], costs[env, i], arrivals[env, i] = distance, hit, arrived
-            smallest[env, i], to_obstacle[env, i] = memory.nearest[i, env], memory.clearance[i, env]
-        terminated[env] = everybody or (end_at_collision and collision)
+            for env in range(first, last):
+                square = 0.0
+                for c in range(dim):
+                    gap = memory.goal[i, c, env] - x[positions[i, c], env]
+                    square += gap * gap
+                distance = np.sqrt(square)
+                arrived = distance <= goal_radius
+                hit = memory.nearest[i, env] < 2.0 * radius or memory.clearance[i, env] < radius
+                terminated[env] &= arrived
+                collided[env - first] |= hit
+                value = _distance(memory.goal, memory.before, i, env) - distance - of_effort * effort[i, env]
+                reward[env, i] = value + (bonus * arrived * (1.0 - memory.reached[i, env]) - penalty * hit)
+                error[env, i], costs[env, i], arrivals[env, i] = distance, hit, arrived
+                smallest[env, i], to_obstacle[env, i] = memory.nearest[i, env], memory.clearance[i, env]
+        for env in range(first, last):
+            terminated[env] = terminated[env] or (end_at_collision and collided[env - first])
 
 
 @compiled

@@ -157,7 +157,7 @@ class Navigation(Task):
         sizes = float(self.goal_radius), float(self.arena.radius)
         ends = self.end_at_collision
         world.each(
-            lambda low, high: evaluate_goals(*arrays, *results, weights, sizes, ends, low, high), 10 * len(self._effort)
+            lambda low, high: evaluate_goals(*arrays, *results, weights, sizes, ends, low, high), 30 * len(self._effort)
         )
         if self.reward == "team":
             reward[...] = reward.mean(axis=1, keepdims=True)

@@ -25,11 +25,11 @@ def recorded(env):
     simulator, seen = env.batched.simulator, []
     advance = simulator.step_unchecked
 
-    def spied(dt, parts):
+    def spied(dt, parts, u):
         assert dt == pytest.approx(PERIOD / SUBSTEPS)
-        held = simulator.u.copy()
+        held = u.T.copy()
         seen.append(held[0] / env.batched.fleet.input_limit)
-        advance(dt, parts)
+        advance(dt, parts, u)
         np.testing.assert_array_equal(simulator.u, held)
 
     simulator.step_unchecked = spied

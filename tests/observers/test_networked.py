@@ -280,7 +280,7 @@ def test_the_scalar_solve_is_exact_from_any_warm_start(seed, scale, stiffness):
             0,
             batch,
         )
-        np.testing.assert_allclose(e, np.tanh(warm / 2.0), atol=1e-11)  # of eps, which is returned in its place
+        np.testing.assert_allclose(e, np.tanh(warm / 2.0), atol=1e-14)  # of eps, which is returned in its place
         for side in (-1.0, 1.0):  # the equation changes its sign within 1e-9 of the solution
             near = warm + side * 1e-9 * (1.0 + np.abs(warm))
             excess = np.tanh(near / 2.0) + tau * near * (1.0 + np.cosh(near)) - predictor

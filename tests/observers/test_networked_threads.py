@@ -40,7 +40,7 @@ def require_equal(first: dict, second: dict, part: object = slice(None)) -> None
         np.testing.assert_array_equal(values, second[name][..., part], err_msg=name)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(data=st.data(), system=systems(), network=NETWORKS, noise=st.sampled_from([0.0, 0.1]), seed=SEEDS)
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_threads_and_batches_leave_every_bit(data, system, network, noise, seed, estimator):

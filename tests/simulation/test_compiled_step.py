@@ -12,7 +12,7 @@ from khop_env.observers import Exponential, Proximal, SolveError
 from khop_env.observers.performance import Scaled
 from khop_env.physics import VELOCITY_CONTROLLERS, DriftingIntegrator, Sinusoid
 from khop_env.scenarios import Scenario, mixed_fleet, paper
-from khop_env.simulation import Simulator
+from khop_env.simulation import Simulator, compiled_step
 from tests.strategies import SmoothSignals, System, systems
 
 LAWS = {
@@ -51,7 +51,9 @@ def in_python(simulator: Simulator) -> Simulator:
 
 def assert_same_run(compiled: Simulator, python: Simulator, dt: float, steps: int, jump: float = 0.0) -> None:
     """All arrays and running maxima are equal after each step."""
-    assert compiled._compiled is not None
+    compiled.warm_up(long=True)
+    python.warm_up()
+    compiled.observers.evaluations = python.observers.evaluations
     rng = np.random.default_rng(0)
     for _ in range(steps):
         u = None if compiled.plant.law else jump * rng.uniform(-1.0, 1.0, (compiled.num_envs, compiled.fleet.m))
@@ -130,6 +132,7 @@ def test_a_users_model_beside_the_librarys_moves_as_theirs():
 def test_a_step_that_fails_says_why_and_changes_nothing(threads):
     scenario = mixed_fleet()
     simulator = scenario.build(observers=Proximal(2, threads=threads), num_envs=200)
+    simulator.warm_up(long=True)
     simulator.step(0.02)
     column = next(q for q, (_, name, _) in enumerate(simulator.fleet.component_names()) if name == "surge")
     simulator.state.x[column, 150] = 1e200  # whose quadratic drag overflows
@@ -138,3 +141,21 @@ def test_a_step_that_fails_says_why_and_changes_nothing(threads):
         simulator.step(0.02)
     for name, values in simulator.state.arrays().items():
         np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
+
+
+def test_it_is_compiled_where_it_has_been_before_or_in_long_runs_only(monkeypatch):
+    """A short run doesn't wait for its compilation; the bits are the same before and after."""
+    monkeypatch.setattr(compiled_step, "available", lambda *arguments: False)
+    monkeypatch.setattr(compiled_step, "PATIENCE", 3)
+    late, python = paper().build(), in_python(paper().build())
+    chosen = []
+    for _ in range(6):
+        for simulator in (late, python):
+            simulator.step(0.02)
+        chosen.append(late._in_one_call)
+        np.testing.assert_array_equal(late.estimates, python.estimates)
+    assert chosen == [False] * 3 + [True] * 3
+    monkeypatch.setattr(compiled_step, "available", lambda *arguments: True)
+    early = paper().build()
+    early.step(0.02)
+    assert early._in_one_call
