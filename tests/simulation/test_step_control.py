@@ -230,7 +230,8 @@ def test_extremes_are_those_of_accepted_steps():
     simulator = jumping()
     simulator.restore(simulator.save())
     control, own = StepControl(simulator, 1e-4), simulator.extremes
-    simulator.hold(np.full((16, 1), 2.0))
+    simulator.state.u[...] = 2.0
+    simulator.plant.actuate(simulator.state)
     while simulator.t[0] < 1.2 - 1e-12:
         control.step(1.2)
         simulator.observers.raise_extremes(simulator.state, own)
