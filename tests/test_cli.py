@@ -341,7 +341,7 @@ class TestRun:
         assert "can't be read" in refused("run", "nowhere.toml")
         (folder / "taken").write_text("a file")
         assert "taken" in refused("run", "paper", "--out", "taken")
-        for option, value in (("--observe", "all"), ("--integrator", "rk4"), ("--order", "3"), ("--seed", "-1")):
+        for option, value in (("--observe", "all"), ("--integrator", "rk4"), ("--order", "4"), ("--seed", "-1")):
             result = khop("run", "paper", option, value, status=2)
             assert result.stdout == ""
             assert "Traceback" not in result.stderr

@@ -27,7 +27,7 @@ def record_controlled(
     Samples are at fixed times, within steps; they keep the guarantee as the steps do.
 
     Args:
-        simulator: simulator of one environment, just reset, with a law, and with the proximal step of order 2.
+        simulator: simulator of one environment, just reset, with a law, and with the proximal step of order 2 or 3.
         duration: final time in s.
         tolerance: largest estimated error of a step, as in `Simulator.advance`.
         samples_per_second: there are fewer if an array would hold more than `MOST_ROWS` numbers.

@@ -124,6 +124,7 @@ class StepControl:
         self.tolerance, self.last, self.accepted, self.rejected = float(tolerance), 0.0, 0, 0
         self.simulator, self._observers, self.embedded = simulator, observers, EMBEDDED[observers.order]
         self._before, self._extremes = simulator.before, simulator.running_extremes.copied()
+        simulator.state.copy_step(self._before)
         diagonal = TABLEAUS[observers.order].implicit[-1][-1]
         self._weights = np.array(self.embedded.explicit), np.array(self.embedded.implicit), diagonal
         design = simulator.design
