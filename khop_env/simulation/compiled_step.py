@@ -227,7 +227,7 @@ class CompiledStep:
 
     def __init__(self, plant: FleetPlant, observers: Proximal, state: SimulatorState, before: SimulatorState) -> None:
         design, fleet, batch = observers.design, plant.fleet, plant.num_envs
-        self._plant, self._observers, self._state = plant, observers, state
+        self._plant, self._observers, self._state, self._before = plant, observers, state, before
         self._ranges = plant.threads.ranges(batch)
         self._waited = -1  # steps since its code was looked for on disk
         states, inputs, edges = design.states, design.inputs, plant.edges
@@ -286,6 +286,7 @@ class CompiledStep:
         Raises:
             SolveError: if a number isn't finite; the state is undefined then.
         """
+        self._before.t.fill(np.nan)  # a number from where the step begins in an environment: see Simulator.take_back
         run: Any = step
         common = self._arguments(dt, extremes, held)
         if len(self._ranges) == 1:

@@ -227,7 +227,7 @@ class Simulator(Readings):
             u: (m, B) physical inputs to hold from now on, batch last and finite, where there is no law.
         """
         self._require_whole()
-        state, before, copied = self.state, self.before, self.observers.copied
+        state, copied = self.state, self.observers.copied
         self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
         held = False
         if u is not None:
@@ -236,7 +236,7 @@ class Simulator(Readings):
             if not held:
                 self.plant.actuate(state)
         whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
-        start = state.copy() if parts > 1 else before
+        start = state.copy() if parts > 1 else state
         self._keep()  # not in the block below: where it is interrupted halfway nothing has to be restored
         try:
             for part in range(parts):
@@ -244,12 +244,17 @@ class Simulator(Readings):
                     self._keep()
                 self._one_step(dt / parts, held)
         except BaseException as error:
-            start.copy_step(state, whole)
+            if parts > 1:
+                start.copy_step(state, whole)
+            else:
+                self.take_back(whole)
             self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
             raise
 
     def try_step(self, dt: float) -> None:
         """Advance by a single step of `dt` seconds, and raise the extremes. `before` is the state before it.
+
+        Where this raises, `take_back` has to follow.
 
         Raises:
             FunnelError: as `step`; the state is undefined then.
@@ -258,6 +263,20 @@ class Simulator(Readings):
         self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
         self._keep()
         self._one_step(dt, False)
+
+    def take_back(self, memory: bool = True) -> None:
+        """Return to the state before the last step, wherever that was interrupted.
+
+        Args:
+            memory: whether the observers' memory was copied, too.
+        """
+        begun = self.before.t == self.before.t  # not where the compiled step was interrupted before it began
+        if begun.all():
+            self.before.copy_step(self.state, memory)
+            return
+        before, ours = self.before.arrays(), self.state.arrays()
+        for name in ours.keys() - {"drawn"}:
+            ours[name][..., begun] = before[name][..., begun]
 
     def _keep(self) -> None:
         """Copy the present state to `before`, unless the compiled step does."""

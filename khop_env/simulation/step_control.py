@@ -124,7 +124,6 @@ class StepControl:
         self.tolerance, self.last, self.accepted, self.rejected = float(tolerance), 0.0, 0, 0
         self.simulator, self._observers, self.embedded = simulator, observers, EMBEDDED[observers.order]
         self._before, self._extremes = simulator.before, simulator.running_extremes.copied()
-        simulator.state.copy_step(self._before)
         diagonal = TABLEAUS[observers.order].implicit[-1][-1]
         self._weights = np.array(self.embedded.explicit), np.array(self.embedded.implicit), diagonal
         design = simulator.design
@@ -218,7 +217,7 @@ class StepControl:
         return None
 
     def _take_back(self) -> None:
-        self._before.copy_step(self.simulator.state)
+        self.simulator.take_back()
         for running, kept in zip(self.simulator.running_extremes, self._extremes, strict=True):
             np.copyto(running, kept)
 

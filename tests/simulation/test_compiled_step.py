@@ -159,3 +159,29 @@ def test_it_is_compiled_where_it_has_been_before_or_in_long_runs_only(monkeypatc
     early = paper().build()
     early.step(0.02)
     assert early._in_one_call
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_an_interrupt_before_or_between_threads_changes_nothing(parts, monkeypatch):
+    """Ctrl-C may come before the compiled code has begun, or after it has ended in some threads only."""
+    simulator = paper().build(observers=Proximal(1, threads=2), num_envs=6)
+    simulator.warm_up(long=True)
+    simulator.step(0.05)
+    saved = simulator.save()
+
+    def before_it(function, ranges):
+        raise KeyboardInterrupt
+
+    def in_the_middle(function, ranges):
+        function(ranges[1])
+        raise KeyboardInterrupt
+
+    for run in (before_it, in_the_middle):
+        with monkeypatch.context() as patched:
+            patched.setattr(simulator.plant.threads, "run", run)
+            with pytest.raises(KeyboardInterrupt):
+                simulator.step_unchecked(0.05, parts)
+        for name, values in simulator.state.arrays().items():
+            np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
+    simulator.step(0.05)
+    assert simulator.t == pytest.approx(0.1)
