@@ -65,10 +65,24 @@ def test_sine_is_accurate_and_odd():
     np.testing.assert_array_equal(values, -evaluate(elementary.sin, -x))
 
 
+def test_cosine_is_accurate_and_even():
+    x = np.concatenate([RNG.uniform(-1e4, 1e4, 40_000), RNG.uniform(-np.pi, np.pi, 40_000), TINY, [0.0]])
+    values = evaluate(elementary.cos, x)
+    assert np.max(np.abs(values - np.cos(x))) < 4e-16
+    np.testing.assert_allclose(values, evaluate(elementary.cos, -x), rtol=0.0, atol=4e-16)
+
+
 def test_result_does_not_depend_on_the_place_in_a_vector():
     """Vectorised bodies and scalar remainders must agree to the bit, or a batch would change a trajectory."""
     x = RNG.uniform(-0.999, 0.999, 61)
-    for function in (elementary.expm1, elementary.log, elementary.tanh, elementary.sin, elementary.log_ratio):
+    for function in (
+        elementary.expm1,
+        elementary.log,
+        elementary.tanh,
+        elementary.sin,
+        elementary.cos,
+        elementary.log_ratio,
+    ):
         values = np.abs(x) if function is elementary.log else x
         whole = evaluate(function, values)
         alone = np.array([evaluate(function, values[i : i + 1])[0] for i in range(x.size)])

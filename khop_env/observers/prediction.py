@@ -9,7 +9,7 @@ import numpy as np
 from khop_env.observers.design import ObserverDesign
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.physics import AgentModel, read_only
-from khop_env.physics.right_hand_sides import Runs
+from khop_env.physics.right_hand_sides import Runs, drifts
 
 
 class _DriftRun(NamedTuple):
@@ -34,6 +34,9 @@ class Prediction:
         self._inputs = _shared_columns(design)
         predicted = sum(run.columns.stop - run.columns.start for run in self._drifts)
         self._all_drifts_known = predicted == design.states.layout.size
+        known = all(run.model.form is not None for run in self._drifts)
+        parts = [(run.model, run.pairs, run.columns.start, 0) for run in self._drifts]
+        self._runs: tuple[Any, ...] | None = tuple(Runs.of(parts)) if known else None
 
     def compiled_runs(self) -> tuple[Any, IntArray, bool]:
         """What `rate` adds up, for a compiled loop.
@@ -43,20 +46,21 @@ class Prediction:
             (3, K) runs of estimates with an input observer: first row, the same among the input estimates, number; and
             whether all estimates have a drift.
         """
-        known = all(run.model.form is not None for run in self._drifts)
-        runs = tuple(Runs.of([(run.model, run.pairs, run.columns.start, 0) for run in self._drifts])) if known else None
         inputs = [(states.start, ours.start, states.stop - states.start) for states, ours in self._inputs]
         table = np.ascontiguousarray(np.array(inputs, np.int64).reshape(-1, 3).T)
-        return runs, table, self._all_drifts_known
+        return self._runs, table, self._all_drifts_known
 
     def rate(self, t: FloatArray, estimate: FloatArray, input_estimate: FloatArray, out: FloatArray) -> None:
         """Write f_i(x_hat) + g_hat into `out` (P, B), at times (B,), estimates (P, B) and input estimates (Q, B)."""
         if not self._all_drifts_known:
             out.fill(0.0)
-        times = read_only(t[:, None])
-        for model, columns, pairs in self._drifts:
-            rates = model.drift(times, read_only(estimate[columns].T.reshape(self._num_envs, pairs, model.n)))
-            out[columns] = rates.reshape(self._num_envs, -1).T
+        if self._runs is not None:
+            drifts(self._runs, estimate, out, 0, self._num_envs)
+        else:
+            times = read_only(t[:, None])
+            for model, columns, pairs in self._drifts:
+                rates = model.drift(times, read_only(estimate[columns].T.reshape(self._num_envs, pairs, model.n)))
+                out[columns] = rates.reshape(self._num_envs, -1).T
         for state_columns, input_columns in self._inputs:
             out[state_columns] += input_estimate[input_columns]
 
