@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from khop_env.compiled import available, compiled, inlined, numba, pasted, place
+from khop_env.elementary import combine, copy_block
 from khop_env.observers import FloatArray, IntArray, Observers, Proximal
 from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
@@ -19,7 +20,7 @@ from khop_env.observers.performance import exponentials
 from khop_env.observers.solve import solve
 from khop_env.physics.right_hand_sides import drifts, input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
-from khop_env.simulation.plant import FleetPlant, advance_plant, combine, copy_block, require_finite
+from khop_env.simulation.plant import FleetPlant, advance_plant, require_finite
 from khop_env.simulation.state import SimulatorState
 
 PATIENCE = 2000

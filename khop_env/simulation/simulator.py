@@ -277,6 +277,7 @@ class Simulator(Readings):
         before, ours = self.before.arrays(), self.state.arrays()
         for name in ours.keys() - {"drawn"}:
             ours[name][..., begun] = before[name][..., begun]
+        self.plant.effect(self.state)  # of inputs that are new in the others
 
     def _keep(self) -> None:
         """Copy the present state to `before`, unless the compiled step does."""
