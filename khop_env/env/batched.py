@@ -24,6 +24,7 @@ from khop_env.env.state import EnvState, Infos, Step, signature
 from khop_env.observers import FloatArray, IntArray
 from khop_env.simulation import Simulator
 from khop_env.simulation.received import ReceivedStates, links_up
+from khop_env.simulation.state import selected
 from khop_env.tasks import Outcome, Task, World
 from khop_env.tasks.checks import require_columns, require_outcome
 from khop_env.threads import Threads
@@ -161,7 +162,7 @@ class BatchedEnv:
                 or infinite; nothing has been reset then.
             DesignError: for initial states outside the funnels; likewise.
         """
-        chosen = self.simulator.env_list(env_ids)
+        chosen = selected(env_ids, self.num_envs)
         chosen_seeds = seeds(seed, chosen)
         generators = [self._generator(int(b), own) for b, own in zip(chosen, chosen_seeds, strict=True)]
         if initial_states is not None:

@@ -7,19 +7,32 @@ environments, so that threads share a batch, and block by block, so that the arr
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from khop_env.compiled import available, compiled, inlined, numba, pasted, place
+from khop_env.compiled import available, compiled, numba
 from khop_env.elementary import combine, copy_block
 from khop_env.observers import FloatArray, IntArray, Observers, Proximal
 from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
 from khop_env.observers.performance import exponentials
+from khop_env.observers.prediction import predict
 from khop_env.observers.solve import solve
-from khop_env.physics.right_hand_sides import drifts, input_maps
+from khop_env.physics.right_hand_sides import input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
+from khop_env.simulation.packing import (
+    System,
+    Values,
+    Work,
+    edges_at,
+    floats_at,
+    integers_at,
+    packed,
+    pairs_at,
+    runs_at,
+    terms_at,
+)
 from khop_env.simulation.plant import FleetPlant, advance_plant, require_finite
 from khop_env.simulation.state import SimulatorState
 
@@ -27,193 +40,6 @@ PATIENCE = 2000
 """Steps of a simulator in Python before the compiled step is compiled, where it hasn't been yet."""
 BLOCK = 128  # environments: enough to fill vector registers, few enough for the cache
 _STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
-
-
-class Values(NamedTuple):
-    """The arrays of a `SimulatorState` that a step changes.
-
-    Attributes:
-        t: (B,) time in s.
-        x: (n, B) states.
-        u: (m, B) inputs.
-        g: (n, B) their effect.
-        estimate: (P, B) estimates of states.
-        input_estimate: (Q, B) estimates of the inputs' effects.
-        eps: (P, B) transformed disagreements.
-        nu: (Q, B) those of the input observers.
-    """
-
-    t: FloatArray
-    x: FloatArray
-    u: FloatArray
-    g: FloatArray
-    estimate: FloatArray
-    input_estimate: FloatArray
-    eps: FloatArray
-    nu: FloatArray
-
-    @classmethod
-    def of(cls, state: SimulatorState) -> Values:
-        """Of a state; its arrays themselves."""
-        memory = (state.memory[name] for name in ("estimate", "input_estimate", "eps", "nu"))
-        return cls(state.t, state.x, state.u, state.g, *memory)
-
-
-class System(NamedTuple):
-    """The equations of a step, by plain tuples with the fields of the named tuples that they are called after.
-
-    Attributes:
-        runs: all agents, of `physics.right_hand_sides.Runs`.
-        estimates: the estimates whose observers know the drift, likewise.
-        terms: of the disturbance, `physics.waveforms.TermArrays`.
-        edges: of the law, `EdgeArrays`.
-        states: the pairs of the state observers, `PairArrays`.
-        inputs: those of the input observers.
-        rho: the funnels' coefficients of the state observers.
-        omega: those of the input observers.
-        state_sums: (pairs,) [M_i^-1 1]_a of the state observers.
-        input_sums: likewise of the input observers.
-        input_runs: (3 K,) K runs of estimates with an input observer: first rows, the same among the input estimates,
-            numbers of rows.
-        sizes: dimension of positions, and whether `estimates` are all estimates.
-    """
-
-    runs: Any
-    estimates: Any
-    terms: Any
-    edges: Any
-    states: Any
-    inputs: Any
-    rho: Any
-    omega: Any
-    state_sums: FloatArray
-    input_sums: FloatArray
-    input_runs: IntArray
-    sizes: IntArray
-
-
-def packed(system: System) -> tuple[IntArray, FloatArray]:
-    """All arrays of a system in two, of integers and of floats, since every argument of a compiled call takes time.
-
-    The integers begin with tables of where each array of integers, and then each of floats, begins and the last ends.
-    """
-    arrays = [np.ravel(each) for part in system for each in (part if isinstance(part, tuple) else (part,))]
-    integers = [each for each in arrays if each.dtype.kind == "i"]
-    floats = [each for each in arrays if each.dtype.kind == "f"]
-    assert (len(integers), len(floats)) == (_INTEGERS, _FLOATS)
-    starts = _INTEGERS + _FLOATS + 2 + np.cumsum([0, *map(len, integers)])
-    float_starts = np.cumsum([0, *map(len, floats)])
-    return np.concatenate([starts, float_starts, *integers]).astype(np.int64), np.concatenate(floats)
-
-
-_INTEGERS, _FLOATS = 49, 18
-
-
-@pasted
-def integers_at(integers: IntArray, q: int) -> IntArray:
-    """Array q of the integers of `packed`."""
-    return integers[integers[q] : integers[q + 1]]
-
-
-@pasted
-def floats_at(integers: IntArray, floats: FloatArray, q: int) -> FloatArray:
-    """Array q of the floats."""
-    return floats[integers[_INTEGERS + 1 + q] : integers[_INTEGERS + 2 + q]]
-
-
-@pasted
-def pairs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
-    """The fields of `PairArrays`, whose first array of integers is q and of floats r."""
-    return (
-        integers_at(n, q),
-        integers_at(n, q + 1),
-        integers_at(n, q + 2),
-        integers_at(n, q + 3),
-        integers_at(n, q + 4),
-        integers_at(n, q + 5),
-        floats_at(n, f, r),
-        floats_at(n, f, r + 1),
-        integers_at(n, q + 6),
-        integers_at(n, q + 7),
-        integers_at(n, q + 8),
-        integers_at(n, q + 9),
-    )
-
-
-@pasted
-def runs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
-    """The fields of `Runs`, likewise."""
-    return (
-        integers_at(n, q),
-        integers_at(n, q + 1),
-        integers_at(n, q + 2),
-        integers_at(n, q + 3),
-        integers_at(n, q + 4),
-        integers_at(n, q + 5),
-        integers_at(n, q + 6),
-        floats_at(n, f, r),
-    )
-
-
-@pasted
-def terms_at(n: IntArray, f: FloatArray, dim: int) -> Any:
-    """The fields of `TermArrays`."""
-    positions = integers_at(n, 19)
-    return (
-        integers_at(n, 14),
-        integers_at(n, 15),
-        floats_at(n, f, 2),
-        floats_at(n, f, 3),
-        integers_at(n, 16),
-        integers_at(n, 17),
-        integers_at(n, 18),
-        floats_at(n, f, 4),
-        positions.reshape(positions.size // dim, dim),
-    )
-
-
-@pasted
-def edges_at(n: IntArray, f: FloatArray, dim: int) -> Any:
-    """The fields of `EdgeArrays`."""
-    own, other, position = integers_at(n, 21), integers_at(n, 22), integers_at(n, 26)
-    return (
-        integers_at(n, 20),
-        own.reshape(own.size // dim, dim),
-        other.reshape(other.size // dim, dim),
-        integers_at(n, 23),
-        integers_at(n, 24),
-        integers_at(n, 25),
-        position.reshape(position.size // dim, dim),
-        floats_at(n, f, 5),
-    )
-
-
-class Work(NamedTuple):
-    """Arrays that a step fills: the stages' rates, and scratch.
-
-    Attributes:
-        rates: (stages, n, B) x' at the stage before.
-        predicted: (stages, P, B) f(x_hat) + g_hat there.
-        slopes: (stages, P, B) corrections of the state observers at the stage.
-        input_slopes: (stages, Q, B) those of the input observers.
-        w: (n, B) disturbance.
-        rho: (rows, B) funnels of the state observers.
-        omega: those of the input observers.
-        terms: (E, d, B) of the law.
-        velocity: (N * d, B) likewise.
-        drift: (n, B) likewise.
-    """
-
-    rates: FloatArray
-    predicted: FloatArray
-    slopes: FloatArray
-    input_slopes: FloatArray
-    w: FloatArray
-    rho: FloatArray
-    omega: FloatArray
-    terms: FloatArray
-    velocity: FloatArray
-    drift: FloatArray
 
 
 class CompiledStep:
@@ -224,9 +50,17 @@ class CompiledStep:
         observers: prepared.
         state: advanced in place.
         before: gets the state at the beginning of each step.
+        extremes_before: gets the running maxima there.
     """
 
-    def __init__(self, plant: FleetPlant, observers: Proximal, state: SimulatorState, before: SimulatorState) -> None:
+    def __init__(
+        self,
+        plant: FleetPlant,
+        observers: Proximal,
+        state: SimulatorState,
+        before: SimulatorState,
+        extremes_before: Extremes,
+    ) -> None:
         design, fleet, batch = observers.design, plant.fleet, plant.num_envs
         self._plant, self._observers, self._state, self._before = plant, observers, state, before
         self._ranges = plant.threads.ranges(batch)
@@ -259,7 +93,8 @@ class CompiledStep:
             np.zeros((fleet.position_index.size, batch)),
             np.zeros((fleet.n, batch)),
         )
-        self._arrays = tuple(Values.of(state)), tuple(Values.of(before)), state.drawn, tuple(self._work)
+        values = tuple(Values.of(state)), tuple(Values.of(before))
+        self._arrays = *values, state.drawn, tuple(self._work), tuple(extremes_before)
 
     def ready(self, extremes: Extremes, now: bool = False) -> bool:
         """Whether to use it for the next step, of which this is asked once.
@@ -311,7 +146,11 @@ class CompiledStep:
 
 
 def compiled_step(
-    plant: FleetPlant, observers: Observers, state: SimulatorState, before: SimulatorState
+    plant: FleetPlant,
+    observers: Observers,
+    state: SimulatorState,
+    before: SimulatorState,
+    extremes_before: Extremes,
 ) -> CompiledStep | None:
     """The compiled step, or None where Python is needed: for models, disturbances, laws or funnels of a user, or links
     that come and go.
@@ -321,7 +160,7 @@ def compiled_step(
     design = observers.design
     known = observers.prediction.compiled_runs()[0] is not None
     return (
-        CompiledStep(plant, observers, state, before)
+        CompiledStep(plant, observers, state, before, extremes_before)
         if known and design.states.rho.exponential and design.inputs.rho.exponential
         else None
     )
@@ -339,6 +178,7 @@ def step(
     before: Any,
     drawn: FloatArray,
     work: Any,
+    extremes_before: Any,
     extremes: Any,
     held: bool,
     low: int,
@@ -357,7 +197,8 @@ def step(
         before: likewise, overwritten with the state at the beginning.
         drawn: (B, K) the disturbance's random numbers.
         work: the fields of `Work`.
-        extremes: those of `Extremes`.
+        extremes_before: those of `Extremes`, overwritten with the running maxima at the beginning.
+        extremes: those of `Extremes`, raised.
         held: whether the effect of the inputs has to be computed first.
         low: first environment.
         high: one past the last.
@@ -370,7 +211,8 @@ def step(
     runs, estimates = runs_at(n, f, 0, 0), runs_at(n, f, 7, 1)
     terms, edges = terms_at(n, f, sizes[0]), edges_at(n, f, sizes[0])
     states, inputs = pairs_at(n, f, 27, 6), pairs_at(n, f, 37, 8)
-    now, before, work, extremes = Values(*now), Values(*before), Work(*work), Extremes(*extremes)
+    now, before, work = Values(*now), Values(*before), Work(*work)
+    extremes, earlier = Extremes(*extremes), Extremes(*extremes_before)
     observed, evaluations = inputs[0].size, 0
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
@@ -378,6 +220,9 @@ def step(
             input_maps(runs, now.x, now.u, now.g, begin, end)
         for e in range(begin, end):
             before.t[e] = now.t[e]
+            earlier.normalized[e], earlier.relative[e] = extremes.normalized[e], extremes.relative[e]
+            earlier.input_normalized[e] = extremes.input_normalized[e]
+            earlier.input_relative[e] = extremes.input_relative[e]
         copy_block(now.x, before.x, begin, end)
         copy_block(now.u, before.u, begin, end)
         copy_block(now.g, before.g, begin, end)
@@ -486,28 +331,3 @@ def step(
                 end,
             )
     return 0, evaluations, -1, -1
-
-
-@inlined
-def predict(
-    runs: Any,
-    all_drifts: bool,
-    input_runs: IntArray,
-    estimate: FloatArray,
-    input_estimate: FloatArray,
-    out: FloatArray,
-    low: int,
-    high: int,
-) -> None:
-    """`Prediction.rate`: f(x_hat) + g_hat."""
-    if not all_drifts:
-        for row in range(out.shape[0]):
-            for e in range(high - low):
-                out[row, place(low + e)] = 0.0
-    drifts(runs, estimate, out, low, high)
-    count = input_runs.size // 3
-    for run in range(count):
-        to, source = input_runs[run], input_runs[count + run]
-        for q in range(input_runs[2 * count + run]):
-            for e in range(high - low):
-                out[to + q, place(low + e)] += input_estimate[source + q, place(low + e)]

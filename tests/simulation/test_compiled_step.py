@@ -192,11 +192,24 @@ def test_a_step_that_fails_says_why_and_changes_nothing(threads):
     simulator.step(0.02)
     column = next(q for q, (_, name, _) in enumerate(simulator.fleet.component_names()) if name == "surge")
     simulator.state.x[column, 150] = 1e200  # whose quadratic drag overflows
-    saved = simulator.save()
+    saved, extremes = simulator.save(), simulator.extremes
     with pytest.raises(SolveError, match=r"environment 150: state '\w+' of 'vessel_0' became"):
         simulator.step(0.02)
     for name, values in simulator.state.arrays().items():
         np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
+    for ours, theirs in zip(simulator.extremes, extremes, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_inputs_that_are_new_have_their_effect_where_a_step_did_not_begin():
+    """In the environments behind the one that fails, and where Ctrl-C came before the compiled code."""
+    simulator = paper().build(num_envs=300)
+    simulator.warm_up(long=True)
+    u = np.ones((simulator.fleet.m, 300))
+    simulator.state.x[3, 1] = np.nan
+    with pytest.raises(SolveError, match="environment 1:"):
+        simulator.step_unchecked(0.02, 1, u)
+    np.testing.assert_array_equal(simulator.g, u.T)  # of drifters
 
 
 def test_it_is_compiled_where_it_has_been_before_or_in_long_runs_only(monkeypatch):
