@@ -62,6 +62,7 @@ class BatchedEnv:
         self.simulator, self.settings, self.scenario = simulator, settings, scenario
         self.fleet, self.num_envs = simulator.fleet, simulator.num_envs
         inputs, state = np.zeros((self.fleet.m, self.num_envs)), simulator.state
+        shared, wanted = simulator.plant.threads, settings.threads_for(self.num_envs)
         self.world = World(
             simulator.design,
             simulator.task_graph,
@@ -72,7 +73,7 @@ class BatchedEnv:
             x=state.x,
             inputs=inputs,
             initial=simulator.initial,
-            threads=Threads(settings.threads_for(self.num_envs)),
+            threads=shared if shared.count == wanted else Threads(wanted),
         )
         self.task = copy.deepcopy(task)
         self.task.memory = {}  # for those that override `bind` and have none

@@ -87,6 +87,7 @@ class Proximal(FunnelObservers):
         evaluations: of the barrier, in all steps so far.
         prediction: f(x_hat) + g_hat, once prepared.
         stages: the parts of the last step, once prepared.
+        pool: the threads, once prepared.
 
     Raises:
         ValueError: if there is no such order, or threads is out of range.
@@ -117,9 +118,9 @@ class Proximal(FunnelObservers):
         count, pairs, input_pairs = len(self._tableau.nodes), design.states.layout.size, design.inputs.layout.size
         self.prediction = Prediction(design, num_envs)
         self.stages = Stages(*(np.zeros((count, size, num_envs)) for size in (pairs, pairs, input_pairs)))
-        self._threads = Threads(self.threads)
-        self._solve_states = Solver(design.states.layout, num_envs, self._threads)
-        self._solve_inputs = Solver(design.inputs.layout, num_envs, self._threads)
+        self.pool = Threads(self.threads)
+        self._solve_states = Solver(design.states.layout, num_envs, self.pool)
+        self._solve_inputs = Solver(design.inputs.layout, num_envs, self.pool)
 
     def allocate(self) -> Memory:
         """Estimates and warm starts."""

@@ -63,7 +63,6 @@ class CompiledStep:
     ) -> None:
         design, fleet, batch = observers.design, plant.fleet, plant.num_envs
         self._plant, self._observers, self._state, self._before = plant, observers, state, before
-        self._ranges = plant.threads.ranges(batch)
         self._waited = -1  # steps since its code was looked for on disk
         states, inputs, edges = design.states, design.inputs, plant.edges
         runs, input_runs, all_drifts = observers.prediction.compiled_runs()
@@ -125,10 +124,11 @@ class CompiledStep:
         self._before.t.fill(np.nan)  # a number from where the step begins in an environment: see Simulator.take_back
         run: Any = step
         common = self._arguments(dt, extremes, held)
-        if len(self._ranges) == 1:
-            self._settle(*run(*common, *self._ranges[0]))
+        ranges = self._plant.ranges
+        if len(ranges) == 1:
+            self._settle(*run(*common, *ranges[0]))
             return
-        for result in self._plant.threads.run(lambda range_: run(*common, *range_), self._ranges):
+        for result in self._plant.threads.run(lambda range_: run(*common, *range_), ranges):
             self._settle(*result)
 
     def _settle(self, failure: int, evaluations: int, env: int, target: int) -> None:

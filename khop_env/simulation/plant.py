@@ -46,6 +46,8 @@ class FleetPlant:
         runs: the fields of `physics.right_hand_sides.Runs` of all agents; None where a model is Python.
         terms: those of `physics.waveforms.TermArrays`; None where a disturbance is Python.
         edges: of the law.
+        threads: that share the batch.
+        ranges: of environments, one for each thread.
     """
 
     def __init__(
@@ -61,7 +63,7 @@ class FleetPlant:
         self.fleet, self.num_envs = fleet, num_envs
         self.disturbance, self.law, self.views = disturbance, law, views
         self.threads = threads or Threads(1)
-        self._ranges = self.threads.ranges(num_envs)
+        self.ranges = self.threads.ranges(num_envs)
         self._limit = fleet.input_limit[:, None] if saturated else None
         self._rates = np.zeros((0, fleet.n, num_envs))
         attached = AttachedDisturbance((), fleet) if disturbance is None else disturbance
@@ -105,7 +107,7 @@ class FleetPlant:
         def part(range_: Range) -> bool:
             return advance_plant(*common, *range_)
 
-        if not all(self.threads.run(part, self._ranges)):
+        if not all(self.threads.run(part, self.ranges)):
             require_finite(state.x, self.fleet)
 
     def rates_of(self, stages: int) -> FloatArray:
@@ -153,7 +155,7 @@ class FleetPlant:
             self.fleet.input_map(self._t, self._bind(state), self._inputs, self._effects)
             return
         common = self.runs, state.x, state.u, state.g
-        self.threads.run(lambda range_: input_maps(*common, *range_), self._ranges)
+        self.threads.run(lambda range_: input_maps(*common, *range_), self.ranges)
 
     def checked_inputs(self, u: ArrayLike) -> FloatArray:
         """Inputs (m,) or (B, m) that are to be held, checked.

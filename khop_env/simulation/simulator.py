@@ -30,7 +30,6 @@ from khop_env.simulation.readings import Readings
 from khop_env.simulation.state import SimulatorState, selected
 from khop_env.simulation.step_control import StepControl, StepCount
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
-from khop_env.threads import Threads
 
 _WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
 
@@ -90,7 +89,7 @@ class Simulator(Readings):
         self.observers.prepare(design, num_envs, Assumptions(initial.center, initial.radius, pushed))
         self.task_graph = nx.empty_graph(len(self.fleet)) if task is None else task
         views = None if law is None else ViewBuilder(design, self.observers, self.task_graph, observe, num_envs)
-        threads, saturated = Threads(getattr(self.observers, "threads", 1)), self.observers.by_messages
+        threads, saturated = getattr(self.observers, "pool", None), self.observers.by_messages
         self.plant = FleetPlant(self.fleet, num_envs, attached, law, views, saturated=saturated, threads=threads)
         self.state = SimulatorState(
             t=np.zeros(num_envs),
