@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import available, compiled, inlined, numba, pasted, place
+from khop_env.compiled import available, compiled, inlined, numba, place
 from khop_env.observers import FloatArray, IntArray, Observers, Proximal
 from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
@@ -19,12 +19,27 @@ from khop_env.observers.performance import exponentials
 from khop_env.observers.solve import solve
 from khop_env.physics.right_hand_sides import drifts, input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
+from khop_env.simulation.packed_system import (
+    System,
+    all_drifts_in,
+    edges_in,
+    estimates_in,
+    input_runs_in,
+    inputs_in,
+    omega_in,
+    packed,
+    rho_in,
+    runs_in,
+    states_in,
+    sums_in,
+    terms_in,
+)
 from khop_env.simulation.plant import FleetPlant, advance_plant, combine, copy_block, require_finite
 from khop_env.simulation.state import SimulatorState
 
 PATIENCE = 2000
 """Steps of a simulator in Python before the compiled step is compiled, where it hasn't been yet."""
-BLOCK = 128  # environments: enough to fill vector registers, few enough for the cache
+BLOCK = 256  # environments: enough to fill vector registers, few enough for the cache
 _STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
 
 
@@ -56,135 +71,6 @@ class Values(NamedTuple):
         """Of a state; its arrays themselves."""
         memory = (state.memory[name] for name in ("estimate", "input_estimate", "eps", "nu"))
         return cls(state.t, state.x, state.u, state.g, *memory)
-
-
-class System(NamedTuple):
-    """The equations of a step, by plain tuples with the fields of the named tuples that they are called after.
-
-    Attributes:
-        runs: all agents, of `physics.right_hand_sides.Runs`.
-        estimates: the estimates whose observers know the drift, likewise.
-        terms: of the disturbance, `physics.waveforms.TermArrays`.
-        edges: of the law, `EdgeArrays`.
-        states: the pairs of the state observers, `PairArrays`.
-        inputs: those of the input observers.
-        rho: the funnels' coefficients of the state observers.
-        omega: those of the input observers.
-        state_sums: (pairs,) [M_i^-1 1]_a of the state observers.
-        input_sums: likewise of the input observers.
-        input_runs: (3 K,) K runs of estimates with an input observer: first rows, the same among the input estimates,
-            numbers of rows.
-        sizes: dimension of positions, and whether `estimates` are all estimates.
-    """
-
-    runs: Any
-    estimates: Any
-    terms: Any
-    edges: Any
-    states: Any
-    inputs: Any
-    rho: Any
-    omega: Any
-    state_sums: FloatArray
-    input_sums: FloatArray
-    input_runs: IntArray
-    sizes: IntArray
-
-
-def packed(system: System) -> tuple[IntArray, FloatArray]:
-    """All arrays of a system in two, of integers and of floats, since every argument of a compiled call takes time.
-
-    The integers begin with tables of where each array of integers, and then each of floats, begins and the last ends.
-    """
-    arrays = [np.ravel(each) for part in system for each in (part if isinstance(part, tuple) else (part,))]
-    integers = [each for each in arrays if each.dtype.kind == "i"]
-    floats = [each for each in arrays if each.dtype.kind == "f"]
-    assert (len(integers), len(floats)) == (_INTEGERS, _FLOATS)
-    starts = _INTEGERS + _FLOATS + 2 + np.cumsum([0, *map(len, integers)])
-    float_starts = np.cumsum([0, *map(len, floats)])
-    return np.concatenate([starts, float_starts, *integers]).astype(np.int64), np.concatenate(floats)
-
-
-_INTEGERS, _FLOATS = 49, 18
-
-
-@pasted
-def integers_at(integers: IntArray, q: int) -> IntArray:
-    """Array q of the integers of `packed`."""
-    return integers[integers[q] : integers[q + 1]]
-
-
-@pasted
-def floats_at(integers: IntArray, floats: FloatArray, q: int) -> FloatArray:
-    """Array q of the floats."""
-    return floats[integers[_INTEGERS + 1 + q] : integers[_INTEGERS + 2 + q]]
-
-
-@pasted
-def pairs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
-    """The fields of `PairArrays`, whose first array of integers is q and of floats r."""
-    return (
-        integers_at(n, q),
-        integers_at(n, q + 1),
-        integers_at(n, q + 2),
-        integers_at(n, q + 3),
-        integers_at(n, q + 4),
-        integers_at(n, q + 5),
-        floats_at(n, f, r),
-        floats_at(n, f, r + 1),
-        integers_at(n, q + 6),
-        integers_at(n, q + 7),
-        integers_at(n, q + 8),
-        integers_at(n, q + 9),
-    )
-
-
-@pasted
-def runs_at(n: IntArray, f: FloatArray, q: int, r: int) -> Any:
-    """The fields of `Runs`, likewise."""
-    return (
-        integers_at(n, q),
-        integers_at(n, q + 1),
-        integers_at(n, q + 2),
-        integers_at(n, q + 3),
-        integers_at(n, q + 4),
-        integers_at(n, q + 5),
-        integers_at(n, q + 6),
-        floats_at(n, f, r),
-    )
-
-
-@pasted
-def terms_at(n: IntArray, f: FloatArray, dim: int) -> Any:
-    """The fields of `TermArrays`."""
-    positions = integers_at(n, 19)
-    return (
-        integers_at(n, 14),
-        integers_at(n, 15),
-        floats_at(n, f, 2),
-        floats_at(n, f, 3),
-        integers_at(n, 16),
-        integers_at(n, 17),
-        integers_at(n, 18),
-        floats_at(n, f, 4),
-        positions.reshape(positions.size // dim, dim),
-    )
-
-
-@pasted
-def edges_at(n: IntArray, f: FloatArray, dim: int) -> Any:
-    """The fields of `EdgeArrays`."""
-    own, other, position = integers_at(n, 21), integers_at(n, 22), integers_at(n, 26)
-    return (
-        integers_at(n, 20),
-        own.reshape(own.size // dim, dim),
-        other.reshape(other.size // dim, dim),
-        integers_at(n, 23),
-        integers_at(n, 24),
-        integers_at(n, 25),
-        position.reshape(position.size // dim, dim),
-        floats_at(n, f, 5),
-    )
 
 
 class Work(NamedTuple):
@@ -365,10 +251,9 @@ def step(
         What failed, if anything (_STATE, _STATES or _INPUTS), and then as `solve`.
     """
     n, f = integers, floats
-    sizes, input_runs = integers_at(n, 48), integers_at(n, 47)
-    runs, estimates = runs_at(n, f, 0, 0), runs_at(n, f, 7, 1)
-    terms, edges = terms_at(n, f, sizes[0]), edges_at(n, f, sizes[0])
-    states, inputs = pairs_at(n, f, 27, 6), pairs_at(n, f, 37, 8)
+    runs, estimates, input_runs, all_drifts = runs_in(n, f), estimates_in(n, f), input_runs_in(n), all_drifts_in(n)
+    terms, edges, states, inputs = terms_in(n, f), edges_in(n, f), states_in(n, f), inputs_in(n, f)
+    rho, omega, (state_sums, input_sums) = rho_in(n, f), omega_in(n, f), sums_in(n, f)
     now, before, work, extremes = Values(*now), Values(*before), Work(*work), Extremes(*extremes)
     observed, evaluations = inputs[0].size, 0
     for begin in range(low, high, BLOCK):
@@ -386,9 +271,7 @@ def step(
         copy_block(now.nu, before.nu, begin, end)
         for s in range(nodes.size):
             tau = implicit[s, s]
-            predict(
-                estimates, sizes[1] > 0, input_runs, now.estimate, now.input_estimate, work.predicted[s], begin, end
-            )
+            predict(estimates, all_drifts, input_runs, now.estimate, now.input_estimate, work.predicted[s], begin, end)
             if not advance_plant(
                 runs,
                 terms,
@@ -409,7 +292,7 @@ def step(
                 return _STATE, evaluations, -1, -1
             combine(before.estimate, explicit[s], s + 1, work.predicted, now.estimate, begin, end)
             combine(now.estimate, implicit[s], s, work.slopes, now.estimate, begin, end)
-            exponentials(now.t, floats_at(n, f, 10), floats_at(n, f, 11), floats_at(n, f, 12), work.rho, begin, end)
+            exponentials(now.t, rho[0], rho[1], rho[2], work.rho, begin, end)
             count, env, target = solve(
                 states,
                 tau,
@@ -443,9 +326,7 @@ def step(
             if observed:
                 if s:
                     combine(before.input_estimate, implicit[s], s, work.input_slopes, now.input_estimate, begin, end)
-                exponentials(
-                    now.t, floats_at(n, f, 13), floats_at(n, f, 14), floats_at(n, f, 15), work.omega, begin, end
-                )
+                exponentials(now.t, omega[0], omega[1], omega[2], work.omega, begin, end)
                 count, env, target = solve(
                     inputs,
                     tau,
@@ -466,7 +347,7 @@ def step(
             now.estimate,
             now.x,
             work.rho,
-            floats_at(n, f, 16),
+            state_sums,
             extremes.normalized,
             extremes.relative,
             begin,
@@ -478,7 +359,7 @@ def step(
                 now.input_estimate,
                 now.g,
                 work.omega,
-                floats_at(n, f, 17),
+                input_sums,
                 extremes.input_normalized,
                 extremes.input_relative,
                 begin,
