@@ -31,7 +31,20 @@ from khop_env.registry import scenario
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Simulator, StepControl
 from khop_env.simulation.edge_law import command_inputs
-from khop_env.simulation.packing import Values, Work, edges_at, floats_at, integers_at, pairs_at, runs_at, terms_at
+from khop_env.simulation.packed_system import (
+    Values,
+    Work,
+    all_drifts_in,
+    edges_in,
+    estimates_in,
+    input_runs_in,
+    inputs_in,
+    omega_in,
+    rho_in,
+    runs_in,
+    states_in,
+    terms_in,
+)
 
 DURATION = 10.0  # s
 INTERVAL = 0.01  # s, between the instants
@@ -53,9 +66,8 @@ def closed_loop(
     """Write the rates of x, x_hat and g_hat of one environment into `rates`; `now` are `Values`, `work` is `Work`."""
     n, f, now, work = integers, floats, Values(*now), Work(*work)
     dx, dy, dghat = rates
-    sizes = integers_at(n, 48)
-    runs, terms, edges = runs_at(n, f, 0, 0), terms_at(n, f, sizes[0]), edges_at(n, f, sizes[0])
-    states, inputs = PairArrays(*pairs_at(n, f, 27, 6)), PairArrays(*pairs_at(n, f, 37, 8))
+    runs, terms, edges, rho, omega = runs_in(n, f), terms_in(n, f), edges_in(n, f), rho_in(n, f), omega_in(n, f)
+    states, inputs = PairArrays(*states_in(n, f)), PairArrays(*inputs_in(n, f))
     command_inputs(law, edges, runs, now.x, now.estimate, now.u, work.terms, work.velocity, work.drift, 0, 1)
     input_maps(runs, now.x, now.u, now.g, 0, 1)
     drifts(runs, now.x, dx, 0, 1)
@@ -63,13 +75,13 @@ def closed_loop(
         disturb(terms, now.t, now.x, drawn, work.w, 0, 1)
     for row in range(dx.shape[0]):
         dx[row, 0] += now.g[row, 0] + work.w[row, 0]
-    exponentials(now.t, floats_at(n, f, 10), floats_at(n, f, 11), floats_at(n, f, 12), work.rho, 0, 1)
+    exponentials(now.t, rho[0], rho[1], rho[2], work.rho, 0, 1)
     disagreement(states, now.estimate, now.x, xi[0])
     correction(states, xi[0], work.rho, e[0], dy)
-    predict(runs_at(n, f, 7, 1), sizes[1] > 0, integers_at(n, 47), now.estimate, now.input_estimate, xi[0], 0, 1)
+    predict(estimates_in(n, f), all_drifts_in(n), input_runs_in(n), now.estimate, now.input_estimate, xi[0], 0, 1)
     for row in range(dy.shape[0]):
         dy[row, 0] += xi[0][row, 0]
-    exponentials(now.t, floats_at(n, f, 13), floats_at(n, f, 14), floats_at(n, f, 15), work.omega, 0, 1)
+    exponentials(now.t, omega[0], omega[1], omega[2], work.omega, 0, 1)
     disagreement(inputs, now.input_estimate, now.g, xi[1])
     correction(inputs, xi[1], work.omega, e[1], dghat)
 

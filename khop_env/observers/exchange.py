@@ -14,7 +14,7 @@ from khop_env.observers.estimators import Estimator, Relay
 from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, merge
 from khop_env.observers.rounds import Rounds
-from khop_env.observers.solve import LANES
+from khop_env.observers.scalar import LANES
 from khop_env.threads import Range, Threads
 
 CHANNEL = "channel."

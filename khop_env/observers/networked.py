@@ -27,7 +27,7 @@ from khop_env.observers.layout import FloatArray, IntArray
 from khop_env.observers.merging import Sources, largest_share
 from khop_env.observers.proximal import MOST_THREADS
 from khop_env.observers.reckoning import Reckoning, certificates_of
-from khop_env.observers.solve import LANES
+from khop_env.observers.scalar import LANES
 from khop_env.observers.steps import Plan, Step, note_length
 from khop_env.physics import hops_from_targets
 from khop_env.threads import Range, Threads

@@ -12,8 +12,8 @@ from khop_env.elementary import expm1
 from khop_env.observers.barrier import barrier, eps_near_impulse
 from khop_env.observers.layout import FloatArray, IntArray, PairArrays
 from khop_env.observers.single import solve_in_single_precision
-from khop_env.observers.solve import LANES
 
+LANES = 64  # equations solved side by side
 _FEW, _MANY = 8, 100  # iterations from a start; between bounds, where bisection alone would take 60
 _SMALL = 1e-5  # in eps: the error after such a step of Halley's method is its cube
 _EXACT = 4e-16

@@ -36,7 +36,7 @@ from khop_env.observers.weights import Weights
 TOLERANCE = 1e-5  # on eps; Newton's error is its square, far below any step's own
 MAX_ITERATIONS = 200
 DAMPED = 32  # after so many steps come as many halved ones: they end the cycles of a few problems in a million
-LANES = 64  # scalar problems solved side by side: enough to fill vector registers, few enough to stay in cache
+LANES = 256  # scalar problems solved side by side: enough to fill vector registers, few enough to stay in cache
 
 
 @compiled

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from khop_env.observers.layout import FloatArray, PairLayout
-from khop_env.observers.solve import LANES, solve
+from khop_env.observers.solve import solve
 from khop_env.observers.weights import Weights
 from khop_env.threads import Range, Threads
+
+FEWEST = 64  # environments of a thread; with fewer, threads share the targets
 
 
 class Solver:
@@ -20,7 +22,7 @@ class Solver:
     def __init__(self, layout: PairLayout, num_envs: int, threads: Threads) -> None:
         self._pairs, self._threads = layout.packed, threads
         self._all = ((0, num_envs), (0, len(layout.target)))
-        self._by_environment = num_envs >= threads.count * LANES
+        self._by_environment = num_envs >= threads.count * FEWEST
         self._ranges = threads.ranges(self._all[0 if self._by_environment else 1][1])
 
     def __call__(

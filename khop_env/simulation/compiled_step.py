@@ -21,24 +21,29 @@ from khop_env.observers.prediction import predict
 from khop_env.observers.solve import solve
 from khop_env.physics.right_hand_sides import input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
-from khop_env.simulation.packing import (
+from khop_env.simulation.packed_system import (
     System,
     Values,
     Work,
-    edges_at,
-    floats_at,
-    integers_at,
+    all_drifts_in,
+    edges_in,
+    estimates_in,
+    input_runs_in,
+    inputs_in,
+    omega_in,
     packed,
-    pairs_at,
-    runs_at,
-    terms_at,
+    rho_in,
+    runs_in,
+    states_in,
+    sums_in,
+    terms_in,
 )
 from khop_env.simulation.plant import FleetPlant, advance_plant, require_finite
 from khop_env.simulation.state import SimulatorState
 
 PATIENCE = 2000
 """Steps of a simulator in Python before the compiled step is compiled, where it hasn't been yet."""
-BLOCK = 128  # environments: enough to fill vector registers, few enough for the cache
+BLOCK = 256  # environments: enough to fill vector registers, few enough for the cache
 _STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
 
 
@@ -207,10 +212,9 @@ def step(
         What failed, if anything (_STATE, _STATES or _INPUTS), and then as `solve`.
     """
     n, f = integers, floats
-    sizes, input_runs = integers_at(n, 48), integers_at(n, 47)
-    runs, estimates = runs_at(n, f, 0, 0), runs_at(n, f, 7, 1)
-    terms, edges = terms_at(n, f, sizes[0]), edges_at(n, f, sizes[0])
-    states, inputs = pairs_at(n, f, 27, 6), pairs_at(n, f, 37, 8)
+    runs, estimates, input_runs, all_drifts = runs_in(n, f), estimates_in(n, f), input_runs_in(n), all_drifts_in(n)
+    terms, edges, states, inputs = terms_in(n, f), edges_in(n, f), states_in(n, f), inputs_in(n, f)
+    rho, omega, (state_sums, input_sums) = rho_in(n, f), omega_in(n, f), sums_in(n, f)
     now, before, work = Values(*now), Values(*before), Work(*work)
     extremes, earlier = Extremes(*extremes), Extremes(*extremes_before)
     observed, evaluations = inputs[0].size, 0
@@ -232,9 +236,7 @@ def step(
         copy_block(now.nu, before.nu, begin, end)
         for s in range(nodes.size):
             tau = implicit[s, s]
-            predict(
-                estimates, sizes[1] > 0, input_runs, now.estimate, now.input_estimate, work.predicted[s], begin, end
-            )
+            predict(estimates, all_drifts, input_runs, now.estimate, now.input_estimate, work.predicted[s], begin, end)
             if not advance_plant(
                 runs,
                 terms,
@@ -255,7 +257,7 @@ def step(
                 return _STATE, evaluations, -1, -1
             combine(before.estimate, explicit[s], s + 1, work.predicted, now.estimate, begin, end)
             combine(now.estimate, implicit[s], s, work.slopes, now.estimate, begin, end)
-            exponentials(now.t, floats_at(n, f, 10), floats_at(n, f, 11), floats_at(n, f, 12), work.rho, begin, end)
+            exponentials(now.t, rho[0], rho[1], rho[2], work.rho, begin, end)
             count, env, target = solve(
                 states,
                 tau,
@@ -289,9 +291,7 @@ def step(
             if observed:
                 if s:
                     combine(before.input_estimate, implicit[s], s, work.input_slopes, now.input_estimate, begin, end)
-                exponentials(
-                    now.t, floats_at(n, f, 13), floats_at(n, f, 14), floats_at(n, f, 15), work.omega, begin, end
-                )
+                exponentials(now.t, omega[0], omega[1], omega[2], work.omega, begin, end)
                 count, env, target = solve(
                     inputs,
                     tau,
@@ -312,7 +312,7 @@ def step(
             now.estimate,
             now.x,
             work.rho,
-            floats_at(n, f, 16),
+            state_sums,
             extremes.normalized,
             extremes.relative,
             begin,
@@ -324,7 +324,7 @@ def step(
                 now.input_estimate,
                 now.g,
                 work.omega,
-                floats_at(n, f, 17),
+                input_sums,
                 extremes.input_normalized,
                 extremes.input_relative,
                 begin,

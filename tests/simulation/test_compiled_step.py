@@ -110,7 +110,7 @@ def test_it_has_the_bits_of_the_python_loop(law, system: System, order, batch):
 @pytest.mark.parametrize("threads", [2, 3])
 def test_threads_and_blocks_have_the_bits_of_the_python_loop(threads):
     """Of a batch of several blocks, divided in uneven parts."""
-    for scenario, batch in ((paper(), 300), (mixed_fleet(), 135)):
+    for scenario, batch in ((paper(), 2 * compiled_step.BLOCK + 44), (mixed_fleet(), 135)):
         compiled, python = (
             scenario.build(law=make_law(scenario.law), observers=Proximal(2, threads=count), num_envs=batch)
             for count in (threads, 1)
@@ -187,13 +187,14 @@ def test_a_users_model_beside_the_librarys_moves_as_theirs():
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_step_that_fails_says_why_and_changes_nothing(threads):
     scenario = mixed_fleet()
-    simulator = scenario.build(observers=Proximal(2, threads=threads), num_envs=200)
+    failing = compiled_step.BLOCK + 20
+    simulator = scenario.build(observers=Proximal(2, threads=threads), num_envs=failing + 50)
     simulator.warm_up(long=True)
     simulator.step(0.02)
     column = next(q for q, (_, name, _) in enumerate(simulator.fleet.component_names()) if name == "surge")
-    simulator.state.x[column, 150] = 1e200  # whose quadratic drag overflows
+    simulator.state.x[column, failing] = 1e200  # whose quadratic drag overflows
     saved, extremes = simulator.save(), simulator.extremes
-    with pytest.raises(SolveError, match=r"environment 150: state '\w+' of 'vessel_0' became"):
+    with pytest.raises(SolveError, match=rf"environment {failing}: state '\w+' of 'vessel_0' became"):
         simulator.step(0.02)
     for name, values in simulator.state.arrays().items():
         np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
@@ -203,9 +204,9 @@ def test_a_step_that_fails_says_why_and_changes_nothing(threads):
 
 def test_inputs_that_are_new_have_their_effect_where_a_step_did_not_begin():
     """In the environments behind the one that fails, and where Ctrl-C came before the compiled code."""
-    simulator = paper().build(num_envs=300)
+    simulator = paper().build(num_envs=compiled_step.BLOCK + 1)
     simulator.warm_up(long=True)
-    u = np.ones((simulator.fleet.m, 300))
+    u = np.ones((simulator.fleet.m, simulator.num_envs))
     simulator.state.x[3, 1] = np.nan
     with pytest.raises(SolveError, match="environment 1:"):
         simulator.step_unchecked(0.02, 1, u)

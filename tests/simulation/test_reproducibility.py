@@ -10,12 +10,13 @@ from hypothesis import strategies as st
 
 from agents import TanhConsensus, make_law
 from khop_env.observers import Explicit, Exponential, ObserverDesign, Proximal
-from khop_env.observers.solve import LANES
+from khop_env.observers.solve import LANES as LANES_OF_SOLVE
 from khop_env.physics import BandLimitedNoise, DriftingIntegrator, Fleet, Sinusoid, Unicycle
 from khop_env.scenarios import paper
 from khop_env.simulation import InitialSet, Simulator, SimulatorState
 from tests.strategies import SmoothSignals, systems
 
+LANES = LANES_OF_SOLVE // 2  # environments whose agents have two components
 INTEGRATORS = {"explicit": Explicit, "order 1": lambda: Proximal(1), "order 2": lambda: Proximal(2)}
 
 
