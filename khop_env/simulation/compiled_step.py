@@ -67,7 +67,7 @@ class CompiledStep:
         extremes_before: Extremes,
     ) -> None:
         design, fleet, batch = observers.design, plant.fleet, plant.num_envs
-        self._plant, self._observers, self._state, self._before = plant, observers, state, before
+        self._plant, self._observers, self._state = plant, observers, state
         self._waited = -1  # steps since its code was looked for on disk
         states, inputs, edges = design.states, design.inputs, plant.edges
         runs, input_runs, all_drifts = observers.prediction.compiled_runs()
@@ -126,7 +126,6 @@ class CompiledStep:
         Raises:
             SolveError: if a number isn't finite; the state is undefined then.
         """
-        self._before.t.fill(np.nan)  # a number from where the step begins in an environment: see Simulator.take_back
         run: Any = step
         common = self._arguments(dt, extremes, held)
         ranges = self._plant.ranges

@@ -136,8 +136,8 @@ class Simulator(Readings):
         if len(seeds) != len(chosen):
             raise ValueError(f"expected one seed or {len(chosen)}, one per environment; got {len(seeds)}")
         generators = [np.random.default_rng(each) for each in seeds]  # raises for an invalid seed
-        start = None if x0 is None else self.initial.checked(x0, len(chosen))
-        if start is not None:
+        if x0 is not None:
+            start = self.initial.checked(x0, len(chosen))
             away = np.abs(start - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
             self.design.require_feasible_start(away, np.zeros(self.fleet.n))
         state, disturbance = self.state, self.plant.disturbance
@@ -146,7 +146,7 @@ class Simulator(Readings):
             state.x[:, b] = self.initial.draw(rng)
             if disturbance is not None:
                 state.drawn[b] = disturbance.draw(rng)
-        if start is not None:
+        if x0 is not None:
             state.x[:, chosen] = np.broadcast_to(start, (len(chosen), self.fleet.n)).T
         for zeros in (state.t, state.u, *self.running_extremes):
             zeros[..., chosen] = 0.0
@@ -255,14 +255,16 @@ class Simulator(Readings):
     def try_step(self, dt: float) -> None:
         """Advance by a single step of `dt` seconds, and raise the extremes. `before` is the state before it.
 
-        Where this raises, `take_back` has to follow.
-
         Raises:
-            FunnelError: as `step`, or `SolveError`; the state is undefined then.
+            FunnelError: as `step`, or `SolveError`; the state is unchanged then.
         """
         self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
         self._keep()
-        self._one_step(dt, False)
+        try:
+            self._one_step(dt, False)
+        except BaseException:
+            self.take_back()
+            raise
 
     def take_back(self, memory: bool = True) -> None:
         """Return to the state and the extremes before the last step, wherever that was interrupted.
@@ -270,18 +272,19 @@ class Simulator(Readings):
         Args:
             memory: whether the observers' memory was copied, too.
         """
-        begun = self.before.t == self.before.t  # not where the compiled step was interrupted before it began
-        where = True if begun.all() else begun
-        self.before.copy_step(self.state, memory, where)
-        self._extremes_before.copy_to(self.running_extremes, where)
-        if where is not True:
+        begun = self.before.t == self.before.t  # a number once the compiled step has begun in an environment
+        self.before.copy_step(self.state, memory, begun)
+        self._extremes_before.copy_to(self.running_extremes, begun)
+        if not begun.all():
             self.plant.effect(self.state)  # of inputs that are new in the others
 
     def _keep(self) -> None:
-        """Note the present state and extremes, unless the compiled step does."""
-        if not self._in_one_call:
-            self.state.copy_step(self.before, self.observers.copied)
-            self.running_extremes.copy_to(self._extremes_before)
+        """Note the present state and extremes, unless the compiled step does: see `take_back`."""
+        if self._in_one_call:
+            self.before.t.fill(np.nan)
+            return
+        self.state.copy_step(self.before, self.observers.copied)
+        self.running_extremes.copy_to(self._extremes_before)
 
     def _one_step(self, dt: float, held: bool) -> None:
         if self._in_one_call:

@@ -156,9 +156,8 @@ class StepControl:
         """Try a step; the size of a shorter one where it was taken back, None where it is accepted."""
         try:
             self.simulator.try_step(size)
-        except BaseException as failed:
-            self.simulator.take_back()
-            if isinstance(failed, SolveError) and size > _SHORTEST:
+        except SolveError:
+            if size > _SHORTEST:
                 return 0.1 * size
             raise
         order = self._observers.order

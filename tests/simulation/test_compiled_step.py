@@ -255,3 +255,21 @@ def test_an_interrupt_before_or_between_threads_changes_nothing(parts, monkeypat
             np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
     simulator.step(0.05)
     assert simulator.t == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("go_on", [lambda each: each.step(0.05), lambda each: each.advance(0.1, tolerance=1e-3)])
+def test_an_interrupt_at_the_very_beginning_changes_nothing(go_on, monkeypatch):
+    """Before the compiled code is even called: the state isn't that before the last step."""
+    simulator = paper().build(law=TanhConsensus(), observers=Proximal(2), num_envs=3)
+    simulator.warm_up(long=True)
+    simulator.step(0.05)
+    saved = simulator.save()
+
+    def interrupted(dt, held):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulator, "_one_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        go_on(simulator)
+    for name, values in simulator.state.arrays().items():
+        np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
