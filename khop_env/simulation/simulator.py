@@ -230,10 +230,9 @@ class Simulator(Readings):
         """
         self._require_whole()
         self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
-        held = False
+        held = u is not None and self._in_one_call and parts == 1  # the compiled step computes their effect itself
         if u is not None:
             self.state.u[...] = u
-            held = self._in_one_call and parts == 1  # the compiled step computes their effect itself
             if not held:
                 self.plant.actuate(self.state)
         whole = self.observers.copied or parts > 1  # otherwise a step can be undone that fails at its beginning only
