@@ -24,14 +24,16 @@ from khop_env.observers import FloatArray, Proximal
 from khop_env.observers.disagreement import correction, disagreement
 from khop_env.observers.layout import PairArrays
 from khop_env.observers.performance import exponentials
+from khop_env.observers.prediction import predict
 from khop_env.physics.right_hand_sides import drifts, input_maps
 from khop_env.physics.waveforms import disturb
 from khop_env.registry import scenario
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Simulator, StepControl
-from khop_env.simulation.compiled_step import Values, Work, predict
 from khop_env.simulation.edge_law import command_inputs
-from khop_env.simulation.packed_system import (
+from khop_env.simulation.packing import (
+    Values,
+    Work,
     all_drifts_in,
     edges_in,
     estimates_in,

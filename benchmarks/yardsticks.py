@@ -12,7 +12,7 @@ from khop_env.elementary import log_ratio
 from khop_env.observers import FloatArray
 from khop_env.observers.disagreement import correction, disagreement
 from khop_env.observers.performance import exponentials
-from khop_env.physics import drifting_integrator_drift
+from khop_env.physics.right_hand_sides import drifter_drift
 from khop_env.physics.waveforms import add_sines
 from khop_env.simulation import Simulator
 from khop_env.simulation.edge_law import displacements, sum_edges
@@ -40,7 +40,7 @@ def closed_loop_derivative(
     displacements(law[2], law[3], law[4], x, y, terms, 0, t.size)
     sum_edges(law[0], True, law[1], terms, u, 0, t.size)
     g = u.reshape(x.shape)
-    drifting_integrator_drift(x, dx)
+    drifter_drift(x.shape[0] // 2, 0, x, dx, 0, t.size)
     w[:] = 0.0
     add_sines(t, sines[0], 0, 1, sines[1], sines[2], w, 0, t.size)
     for column in range(x.shape[0]):
@@ -52,7 +52,7 @@ def closed_loop_derivative(
     exponentials(t, funnels[0], funnels[1], funnels[2], rho, 0, t.size)
     disagreement(states, y, x, xi)
     correction(states, xi, rho, e, dy)
-    drifting_integrator_drift(y, xi)
+    drifter_drift(y.shape[0] // 2, 0, y, xi, 0, t.size)
     for column in range(y.shape[0]):
         for env in range(y.shape[1]):
             dy[column, env] += xi[column, env] + ghat[column, env]

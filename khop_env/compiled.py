@@ -8,7 +8,6 @@ and write.
 from __future__ import annotations
 
 import functools
-import gc
 import hashlib
 import os
 import pickle
@@ -16,11 +15,13 @@ import re
 import sys
 import uuid
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+
+from khop_env.collection import collection_paused
 
 PLAIN = "KHOP_ENV_PLAIN"
 """Environment variable: if it is set Numba isn't loaded, which takes memory and a part of a second."""
@@ -108,18 +109,14 @@ if numba is not None:
         """
 
         def __init__(self) -> None:
-            self._depth, self._was_on = 0, False
+            self._pauses: list[ExitStack] = []
 
         def on_start(self, _: object) -> None:
-            if self._depth == 0:
-                self._was_on = gc.isenabled()
-                gc.disable()
-            self._depth += 1
+            self._pauses.append(ExitStack())
+            self._pauses[-1].enter_context(collection_paused())
 
         def on_end(self, _: object) -> None:
-            self._depth -= 1
-            if self._depth == 0 and self._was_on:
-                gc.enable()
+            self._pauses.pop().close()
 
     event.register("numba:compile", _WithoutCollection())
 

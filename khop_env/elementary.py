@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from khop_env.compiled import compiled, inlined
+from khop_env.compiled import compiled, inlined, place
 
 LN2 = 0.6931471805599453
 _LN2_HIGH = 0.693147180369123816490
@@ -161,18 +161,51 @@ def all_finite(values: NDArray[np.float64]) -> bool:
     return total == 0.0
 
 
-@compiled
-def weighted_sum(
+@inlined
+def combine(
     base: NDArray[np.float64],
     weights: NDArray[np.float64],
-    terms: tuple[NDArray[np.float64], ...],
+    count: int,
+    terms: NDArray[np.float64],
     out: NDArray[np.float64],
+    low: int,
+    high: int,
 ) -> None:
-    """Out = base + sum_k weights[k] terms[k], all of one shape and contiguous."""
-    base, out = base.ravel(), out.ravel()
-    for q in range(base.size):
-        out[q] = base[q]
-    for k in range(len(terms)):
-        term, weight = terms[k].ravel(), weights[k]
-        for q in range(base.size):
-            out[q] += weight * term[q]
+    """Write base + sum of weights[k] terms[k], k below `count`, into the columns low to high - 1 of `out`."""
+    copy_block(base, out, low, high)
+    for k in range(count):
+        weight, term = weights[k], terms[k]
+        if high - low == out.shape[1]:
+            flat, values = out.ravel(), term.ravel()
+            for q in range(flat.size):
+                flat[q] += weight * values[q]
+        else:
+            for row in range(out.shape[0]):
+                for e in range(high - low):
+                    out[row, place(low + e)] += weight * term[row, place(low + e)]
+
+
+@inlined
+def copy_block(values: NDArray[np.float64], out: NDArray[np.float64], low: int, high: int) -> None:
+    """Copy the columns low to high - 1; all of them in one long loop."""
+    if high - low == out.shape[1]:
+        flat, source = out.ravel(), values.ravel()
+        for q in range(flat.size):
+            flat[q] = source[q]
+    else:
+        for row in range(out.shape[0]):
+            for e in range(high - low):
+                out[row, place(low + e)] = values[row, place(low + e)]
+
+
+@inlined
+def add_block(values: NDArray[np.float64], out: NDArray[np.float64], low: int, high: int) -> None:
+    """Add the columns low to high - 1, likewise."""
+    if high - low == out.shape[1]:
+        flat, source = out.ravel(), values.ravel()
+        for q in range(flat.size):
+            flat[q] += source[q]
+    else:
+        for row in range(out.shape[0]):
+            for e in range(high - low):
+                out[row, place(low + e)] += values[row, place(low + e)]

@@ -175,8 +175,7 @@ def print_summary(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None
     if "tolerance" not in summary:
         steps = f"steps of {summary['dt']:g} s"
     else:
-        rejected = summary["rejected_steps"]
-        steps = f"steps of tolerance {summary['tolerance']:g}, {rejected} of them taken back"
+        steps = f"steps of controlled size, tolerance {summary['tolerance']:g}"
     print_text(
         f"{summary['scenario']}: {summary['agents']} agents, {summary['pairs']} pairs of observer and target, "
         f"{summary['duration']:.6g} s in {steps} ({how}), {summary['controller']} on {observed}, "
@@ -245,10 +244,12 @@ def _print_end(summary: Mapping[str, Any], files: Mapping[str, Path]) -> None:
         error = _number(summary["final_consensus_error"], summary["position_unit"])
         print_text(f"consensus error at the end: {error} (|Pi p|: distance of all positions together from their mean)")
     if summary["diverged"]:
+        smaller = "--tolerance" if "tolerance" in summary else "--dt"
         print_text(
-            "the states grew without bound: it seems that the plant diverged; try a smaller --dt, or another law"
+            f"the states grew without bound: it seems that the plant diverged; try a smaller {smaller}, or another law"
         )
-    print_text(f"wall time: {summary['wall_time_s']:.3g} s for {summary['steps']} steps")
+    rejected = f", and {summary['rejected_steps']} that were taken back" if summary.get("rejected_steps") else ""
+    print_text(f"wall time: {summary['wall_time_s']:.3g} s for {summary['steps']} steps{rejected}")
     for name in ("estimates", "states", "summary", "figure", "video"):
         if name in files:
             typer.echo(f"{name}: {files[name]}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeAlias, TypeVar
 
 import numpy as np
@@ -53,10 +53,24 @@ class Threads:
             return [function(ranges[0])]
         if self._pool is None or self._pool[0] != os.getpid():  # a forked child has the object but not the threads
             self._pool = os.getpid(), ThreadPoolExecutor(max(1, self.count - 1))
-        others = [self._pool[1].submit(function, part) for part in ranges[1:]]
+        others: list[Future[T]] = []
         try:
+            for part in ranges[1:]:
+                others.append(self._pool[1].submit(function, part))
             first = function(ranges[0])
         finally:
-            for other in others:
-                other.exception()  # waits
+            _wait(others)
         return [first, *(other.result() for other in others)]
+
+
+def _wait(others: Sequence[Future[T]]) -> None:
+    """Wait until all have ended, also where Ctrl-C comes meanwhile: they write to arrays that its handler restores."""
+    interrupt: BaseException | None = None
+    for other in others:
+        while not other.done():
+            try:
+                other.exception()
+            except BaseException as raised:
+                interrupt = raised
+    if interrupt is not None:
+        raise interrupt

@@ -3,6 +3,8 @@
 import multiprocessing
 import pickle
 import threading
+import time
+from concurrent.futures import Future
 
 import pytest
 
@@ -57,3 +59,26 @@ def test_they_survive_pickling_and_forking() -> None:
     child.start()
     assert queue.get(timeout=30) == 10
     child.join()
+
+
+def test_ctrl_c_waits_until_all_have_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What catches it may write to the arrays that threads write to."""
+    threads, ended, go_on = Threads(2), [], threading.Event()
+    waited = Future.exception
+
+    def interrupted(future: "Future[None]", timeout: float | None = None) -> BaseException | None:
+        if go_on.is_set():
+            return waited(future, timeout)
+        go_on.set()
+        raise KeyboardInterrupt
+
+    def work(part: Range) -> None:
+        if part[0]:
+            go_on.wait(30)
+            time.sleep(0.05)
+            ended.append(part)
+
+    monkeypatch.setattr(Future, "exception", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        threads.run(work, threads.ranges(2))
+    assert ended == [(1, 2)]

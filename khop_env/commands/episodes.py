@@ -133,11 +133,12 @@ def continuous(
         raise ValueError(f"--order {order}: the explicit integrator is forward Euler, of order 1; leave --order out")
     duration = scenario.duration if duration is None else duration
     dt: float = steps["--dt"] if steps["--dt"] is not None else EXPLICIT_STEP if explicit else scenario.dt
-    number_of_steps(duration, dt)  # refuses too many of them before anything is built
+    number_of_steps(duration, dt if tolerance is None else duration)  # refuses too many before anything is built
     law = law_of(scenario, controller)
     made = make_law(law)
-    longest, stiffest = scenario.longest_step
-    parts_of_step(dt, longest, f"the drift of {scenario.fleet.ids[stiffest]!r}")
+    if tolerance is None:
+        longest, stiffest = scenario.longest_step
+        parts_of_step(dt, longest, f"the drift of {scenario.fleet.ids[stiffest]!r}")
     own = Explicit() if explicit else Proximal(scenario.order if order is None else int(order.value))
     observers: Observers = own if over is None else over
     simulator = scenario.build(law=made, observe=observe, observers=observers)

@@ -24,6 +24,7 @@ from khop_env.env.state import EnvState, Infos, Step, signature
 from khop_env.observers import FloatArray, IntArray
 from khop_env.simulation import Simulator
 from khop_env.simulation.received import ReceivedStates, links_up
+from khop_env.simulation.state import selected
 from khop_env.tasks import Outcome, Task, World
 from khop_env.tasks.checks import require_columns, require_outcome
 from khop_env.threads import Threads
@@ -61,6 +62,7 @@ class BatchedEnv:
         self.simulator, self.settings, self.scenario = simulator, settings, scenario
         self.fleet, self.num_envs = simulator.fleet, simulator.num_envs
         inputs, state = np.zeros((self.fleet.m, self.num_envs)), simulator.state
+        shared, wanted = simulator.plant.threads, settings.threads_for(self.num_envs)
         self.world = World(
             simulator.design,
             simulator.task_graph,
@@ -71,7 +73,7 @@ class BatchedEnv:
             x=state.x,
             inputs=inputs,
             initial=simulator.initial,
-            threads=Threads(settings.threads_for(self.num_envs)),
+            threads=shared if shared.count == wanted else Threads(wanted),
         )
         self.task = copy.deepcopy(task)
         self.task.memory = {}  # for those that override `bind` and have none
@@ -161,7 +163,7 @@ class BatchedEnv:
                 or infinite; nothing has been reset then.
             DesignError: for initial states outside the funnels; likewise.
         """
-        chosen = self.simulator.env_list(env_ids)
+        chosen = selected(env_ids, self.num_envs)
         chosen_seeds = seeds(seed, chosen)
         generators = [self._generator(int(b), own) for b, own in zip(chosen, chosen_seeds, strict=True)]
         if initial_states is not None:

@@ -226,3 +226,8 @@ class Extremes(NamedTuple):
     def copied(self) -> Extremes:
         """An independent copy."""
         return Extremes(*(values.copy() for values in self))
+
+    def copy_to(self, other: Extremes, where: NDArray[np.bool_] | bool = True) -> None:
+        """Overwrite another's, in all environments or in some."""
+        for ours, theirs in zip(self, other, strict=True):
+            np.copyto(theirs, ours, where=where)

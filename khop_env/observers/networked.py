@@ -55,6 +55,7 @@ class Networked:
         network: a `Network`.
         estimator: this object's own copy.
         channel: the links; once prepared.
+        pool: the threads; once prepared.
         uncertified: agents whose state has no bound in some component, by index, and why; once prepared.
 
     Raises:
@@ -100,10 +101,10 @@ class Networked:
         shared = 1 + fleet.n + 2 * (layout.size + layout.pairs) + self.message_size * (len(fleet) + layout.pairs)
         self.estimator.prepare(design, self.network, num_envs, shared)
         require_memory(self.estimator, sources.components)
-        self._threads = Threads(self.threads)
-        self._ranges = self._threads.ranges(num_envs, LANES)
+        self.pool = Threads(self.threads)
+        self._ranges = self.pool.ranges(num_envs, LANES)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
-        self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self._threads)
+        self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self.pool)
         self._activity = None if design.schedule is None else design.activity()
         self._up = np.ones((len(design.links), num_envs), np.bool_)
         self._fastest = self._fewest_rounds()
@@ -223,7 +224,7 @@ class Networked:
 
     def _run(self, work: Callable[[Range], T]) -> list[T]:
         """Results of `work` on all environments, a range for each thread."""
-        return self._threads.run(work, self._ranges)
+        return self.pool.run(work, self._ranges)
 
     def _plan_steps(self) -> None:
         """Decide which work may be divided."""
@@ -245,7 +246,7 @@ class Networked:
     def _carry_out(self, plan: Plan[Networked], step: Step) -> None:
         if self._exchange.own is not None and step.rounds:
             step.parts = self._exchange.parts(step.state)  # of the library's estimators: here, on one thread
-        plan.carry_out(self, step, self._threads, self._ranges)
+        plan.carry_out(self, step, self.pool, self._ranges)
 
     def _begin(self, step: Step, part: Range) -> None:
         """Decide what arrives; take over what has been on its way."""

@@ -84,7 +84,7 @@ class Scaled:
 
 def scaled(function: PerformanceFunction, factor: float) -> PerformanceFunction:
     """`factor` times `function`; an `Exponential` if `function` is one."""
-    if isinstance(function, Exponential):
+    if type(function) is Exponential:  # a subclass may have other values
         return Exponential(function.initial * factor, function.final * factor, function.rate)
     return Scaled(function, factor)
 
@@ -113,13 +113,14 @@ class FunnelBank:
 
     def __init__(self, functions: Sequence[PerformanceFunction]) -> None:
         self.functions = tuple(functions)
-        exponential = [f if isinstance(f, Exponential) else Exponential(1.0, 1.0, 1.0) for f in self.functions]
+        # a subclass of it may have other values
+        exponential = [f if type(f) is Exponential else Exponential(1.0, 1.0, 1.0) for f in self.functions]
         self.coefficients = (
             np.array([f.initial - f.final for f in exponential], dtype=float),
             np.array([f.final for f in exponential], dtype=float),
             np.array([f.rate for f in exponential], dtype=float),
         )
-        self._others = [(r, f) for r, f in enumerate(self.functions) if not isinstance(f, Exponential)]
+        self._others = [(r, f) for r, f in enumerate(self.functions) if type(f) is not Exponential]
         self.exponential = not self._others
 
     def __len__(self) -> int:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from khop_env.elementary import weighted_sum
+from khop_env.elementary import combine
 from khop_env.observers.base import Assumptions, Memory, Plant, PlantState, SolveError
 from khop_env.observers.design import Funnels, ObserverDesign
 from khop_env.observers.funnel_observers import FunnelObservers, weights_at
@@ -87,6 +87,7 @@ class Proximal(FunnelObservers):
         evaluations: of the barrier, in all steps so far.
         prediction: f(x_hat) + g_hat, once prepared.
         stages: the parts of the last step, once prepared.
+        pool: the threads, once prepared.
 
     Raises:
         ValueError: if there is no such order, or threads is out of range.
@@ -117,10 +118,9 @@ class Proximal(FunnelObservers):
         count, pairs, input_pairs = len(self._tableau.nodes), design.states.layout.size, design.inputs.layout.size
         self.prediction = Prediction(design, num_envs)
         self.stages = Stages(*(np.zeros((count, size, num_envs)) for size in (pairs, pairs, input_pairs)))
-        self._rates, self._slopes, self._input_slopes = (tuple(each) for each in self.stages)
-        self._threads = Threads(self.threads)
-        self._solve_states = Solver(design.states.layout, num_envs, self._threads)
-        self._solve_inputs = Solver(design.inputs.layout, num_envs, self._threads)
+        self.pool = Threads(self.threads)
+        self._solve_states = Solver(design.states.layout, num_envs, self.pool)
+        self._solve_inputs = Solver(design.inputs.layout, num_envs, self.pool)
 
     def allocate(self) -> Memory:
         """Estimates and warm starts."""
@@ -134,26 +134,28 @@ class Proximal(FunnelObservers):
             SolveError: if a state, input, disturbance or estimate isn't finite.
         """
         memory, last, weights = state.memory, before.memory, self._weights_of(dt)
+        predicted, slopes, input_slopes = self.stages
         estimate, input_estimate = memory["estimate"], memory["input_estimate"]
         for s, node in enumerate(self._tableau.nodes):
             # rates at the stage before: the state holds that stage's values, at its time
-            self.prediction.rate(state.t, estimate, input_estimate, self._rates[s])
+            self.prediction.rate(state.t, estimate, input_estimate, predicted[s])
             explicit, implicit, tau = weights[s]
             plant.stage(s, explicit, node * dt, before, state)
-            weighted_sum(last["estimate"], explicit, self._rates[: s + 1], estimate)
+            combine(last["estimate"], explicit, s + 1, predicted, estimate, 0, self.num_envs)
             if s:
-                weighted_sum(estimate, implicit[:s], self._slopes[:s], estimate)
+                combine(estimate, implicit, s, slopes, estimate, 0, self.num_envs)
             rho = self.rho.at(state.t)
             of_states, of_inputs = weights_at(self.links, state)
-            found = self._solve_states(tau, estimate, state.x, rho, memory["eps"], self._slopes[s], of_states)
+            found = self._solve_states(tau, estimate, state.x, rho, memory["eps"], slopes[s], of_states)
             self.account(found, self.design.states, state.x, rho)
             plant.actuate(state)
             if self.design.inputs.layout.size:
                 if s:
-                    weighted_sum(last["input_estimate"], implicit[:s], self._input_slopes[:s], input_estimate)
+                    combine(last["input_estimate"], implicit, s, input_slopes, input_estimate, 0, self.num_envs)
                 omega = self.omega.at(state.t)
-                slope = self._input_slopes[s]
-                found = self._solve_inputs(tau, input_estimate, state.g, omega, memory["nu"], slope, of_inputs)
+                found = self._solve_inputs(
+                    tau, input_estimate, state.g, omega, memory["nu"], input_slopes[s], of_inputs
+                )
                 self.account(found, self.design.inputs, state.g, omega)
 
     def scheme(self, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:

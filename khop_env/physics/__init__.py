@@ -27,7 +27,6 @@ from khop_env.physics.models import (
     SingleIntegrator,
     SurfaceVessel,
     Unicycle,
-    drifting_integrator_drift,
 )
 from khop_env.physics.velocity import VELOCITY_CONTROLLERS, velocity_to_input
 
@@ -58,7 +57,6 @@ __all__ = [
     "Unicycle",
     "check_task_graph",
     "did_you_mean",
-    "drifting_integrator_drift",
     "hop_distances",
     "hops_from_targets",
     "k_hop_neighbors",

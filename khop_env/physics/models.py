@@ -12,7 +12,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from khop_env.compiled import compiled
 from khop_env.physics.agent_model import AgentModel, FloatArray, InputLimit
 from khop_env.physics.growth import Growth, energy_region, ship_growth
 from khop_env.physics.right_hand_sides import (
@@ -22,7 +21,6 @@ from khop_env.physics.right_hand_sides import (
     UNICYCLE,
     VESSEL,
     Form,
-    drifter_drift,
     drifts,
     evaluated,
     input_maps,
@@ -82,12 +80,6 @@ class SingleIntegrator(AgentModel):
     def drift_growth(self, region: FloatArray | None = None) -> Growth:
         """Two solutions of f = 0 don't part, in any `region`: Lambda = 0."""
         return Growth(np.zeros((self.n, self.n)), spread=np.zeros(self.n))
-
-
-@compiled
-def drifting_integrator_drift(x: FloatArray, out: FloatArray) -> None:
-    """Write the drift of DriftingIntegrator at the columns x (2 agents, B) into `out` of the same shape."""
-    drifter_drift(x.shape[0] // 2, 0, x, out, 0, x.shape[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,7 @@ def record_controlled(
     grid = grid[grid > start_time]
     simulator.warm_up()
     control = StepControl(simulator, tolerance)
+    control.require(duration)
     samples = Samples(simulator, len(grid) + 1, None, None)
     error: Failure | None = None
     with np.errstate(all="ignore"):

@@ -44,6 +44,6 @@ def widened(bound: PerformanceFunction, initial: float) -> Exponential:
     Raises:
         ValueError: if it isn't an `Exponential`.
     """
-    if not isinstance(bound, Exponential):
+    if type(bound) is not Exponential:
         raise ValueError(f"only Exponential bounds can be sized; got {bound!r}")
     return Exponential(max(float(initial), bound.final), bound.final, bound.rate)

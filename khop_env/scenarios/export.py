@@ -216,7 +216,7 @@ def _bounds(scenario: Scenario, bounds: Any, name: str) -> Table:
 def _exponentials(bound: Bound, whose: str) -> dict[str, Any]:
     functions = list(bound) if isinstance(bound, Sequence) else [bound]
     for function in functions:
-        if not isinstance(function, Exponential):
+        if type(function) is not Exponential:
             raise ValueError(
                 f"{whose} can't be written to a file: {function!r} isn't an Exponential; keep this scenario in Python"
             )

@@ -227,7 +227,7 @@ class Scenario:
             self.schedule,
         )
         for name, funnels in (("delta", design.states), ("theta", design.inputs)):
-            for bound in {id(f): f for f in funnels.bounds if not isinstance(f, Exponential)}.values():
+            for bound in {id(f): f for f in funnels.bounds if type(f) is not Exponential}.values():
                 check_bound(bound, name)
         return design
 

@@ -7,20 +7,24 @@ environments, so that threads share a batch, and block by block, so that the arr
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from khop_env.compiled import available, compiled, inlined, numba, place
+from khop_env.compiled import available, compiled, numba
+from khop_env.elementary import combine, copy_block
 from khop_env.observers import FloatArray, IntArray, Observers, Proximal
 from khop_env.observers.base import Extremes
 from khop_env.observers.disagreement import largest_ratios
 from khop_env.observers.performance import exponentials
+from khop_env.observers.prediction import predict
 from khop_env.observers.solve import solve
-from khop_env.physics.right_hand_sides import drifts, input_maps
+from khop_env.physics.right_hand_sides import input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
-from khop_env.simulation.packed_system import (
+from khop_env.simulation.packing import (
     System,
+    Values,
+    Work,
     all_drifts_in,
     edges_in,
     estimates_in,
@@ -34,71 +38,13 @@ from khop_env.simulation.packed_system import (
     sums_in,
     terms_in,
 )
-from khop_env.simulation.plant import FleetPlant, advance_plant, combine, copy_block, require_finite
+from khop_env.simulation.plant import FleetPlant, advance_plant, require_finite
 from khop_env.simulation.state import SimulatorState
 
 PATIENCE = 2000
 """Steps of a simulator in Python before the compiled step is compiled, where it hasn't been yet."""
 BLOCK = 256  # environments: enough to fill vector registers, few enough for the cache
 _STATE, _STATES, _INPUTS = 1, 2, 3  # what failed: a state, the state observers' solve, or the input observers'
-
-
-class Values(NamedTuple):
-    """The arrays of a `SimulatorState` that a step changes.
-
-    Attributes:
-        t: (B,) time in s.
-        x: (n, B) states.
-        u: (m, B) inputs.
-        g: (n, B) their effect.
-        estimate: (P, B) estimates of states.
-        input_estimate: (Q, B) estimates of the inputs' effects.
-        eps: (P, B) transformed disagreements.
-        nu: (Q, B) those of the input observers.
-    """
-
-    t: FloatArray
-    x: FloatArray
-    u: FloatArray
-    g: FloatArray
-    estimate: FloatArray
-    input_estimate: FloatArray
-    eps: FloatArray
-    nu: FloatArray
-
-    @classmethod
-    def of(cls, state: SimulatorState) -> Values:
-        """Of a state; its arrays themselves."""
-        memory = (state.memory[name] for name in ("estimate", "input_estimate", "eps", "nu"))
-        return cls(state.t, state.x, state.u, state.g, *memory)
-
-
-class Work(NamedTuple):
-    """Arrays that a step fills: the stages' rates, and scratch.
-
-    Attributes:
-        rates: (stages, n, B) x' at the stage before.
-        predicted: (stages, P, B) f(x_hat) + g_hat there.
-        slopes: (stages, P, B) corrections of the state observers at the stage.
-        input_slopes: (stages, Q, B) those of the input observers.
-        w: (n, B) disturbance.
-        rho: (rows, B) funnels of the state observers.
-        omega: those of the input observers.
-        terms: (E, d, B) of the law.
-        velocity: (N * d, B) likewise.
-        drift: (n, B) likewise.
-    """
-
-    rates: FloatArray
-    predicted: FloatArray
-    slopes: FloatArray
-    input_slopes: FloatArray
-    w: FloatArray
-    rho: FloatArray
-    omega: FloatArray
-    terms: FloatArray
-    velocity: FloatArray
-    drift: FloatArray
 
 
 class CompiledStep:
@@ -109,12 +55,19 @@ class CompiledStep:
         observers: prepared.
         state: advanced in place.
         before: gets the state at the beginning of each step.
+        extremes_before: gets the running maxima there.
     """
 
-    def __init__(self, plant: FleetPlant, observers: Proximal, state: SimulatorState, before: SimulatorState) -> None:
+    def __init__(
+        self,
+        plant: FleetPlant,
+        observers: Proximal,
+        state: SimulatorState,
+        before: SimulatorState,
+        extremes_before: Extremes,
+    ) -> None:
         design, fleet, batch = observers.design, plant.fleet, plant.num_envs
         self._plant, self._observers, self._state, self._before = plant, observers, state, before
-        self._ranges = plant.threads.ranges(batch)
         self._waited = -1  # steps since its code was looked for on disk
         states, inputs, edges = design.states, design.inputs, plant.edges
         runs, input_runs, all_drifts = observers.prediction.compiled_runs()
@@ -144,7 +97,8 @@ class CompiledStep:
             np.zeros((fleet.position_index.size, batch)),
             np.zeros((fleet.n, batch)),
         )
-        self._arrays = tuple(Values.of(state)), tuple(Values.of(before)), state.drawn, tuple(self._work)
+        values = tuple(Values.of(state)), tuple(Values.of(before))
+        self._arrays = *values, state.drawn, tuple(self._work), tuple(extremes_before)
 
     def ready(self, extremes: Extremes, now: bool = False) -> bool:
         """Whether to use it for the next step, of which this is asked once.
@@ -175,10 +129,11 @@ class CompiledStep:
         self._before.t.fill(np.nan)  # a number from where the step begins in an environment: see Simulator.take_back
         run: Any = step
         common = self._arguments(dt, extremes, held)
-        if len(self._ranges) == 1:
-            self._settle(*run(*common, *self._ranges[0]))
+        ranges = self._plant.ranges
+        if len(ranges) == 1:
+            self._settle(*run(*common, *ranges[0]))
             return
-        for result in self._plant.threads.run(lambda range_: run(*common, *range_), self._ranges):
+        for result in self._plant.threads.run(lambda range_: run(*common, *range_), ranges):
             self._settle(*result)
 
     def _settle(self, failure: int, evaluations: int, env: int, target: int) -> None:
@@ -196,7 +151,11 @@ class CompiledStep:
 
 
 def compiled_step(
-    plant: FleetPlant, observers: Observers, state: SimulatorState, before: SimulatorState
+    plant: FleetPlant,
+    observers: Observers,
+    state: SimulatorState,
+    before: SimulatorState,
+    extremes_before: Extremes,
 ) -> CompiledStep | None:
     """The compiled step, or None where Python is needed: for models, disturbances, laws or funnels of a user, or links
     that come and go.
@@ -206,7 +165,7 @@ def compiled_step(
     design = observers.design
     known = observers.prediction.compiled_runs()[0] is not None
     return (
-        CompiledStep(plant, observers, state, before)
+        CompiledStep(plant, observers, state, before, extremes_before)
         if known and design.states.rho.exponential and design.inputs.rho.exponential
         else None
     )
@@ -224,6 +183,7 @@ def step(
     before: Any,
     drawn: FloatArray,
     work: Any,
+    extremes_before: Any,
     extremes: Any,
     held: bool,
     low: int,
@@ -242,7 +202,8 @@ def step(
         before: likewise, overwritten with the state at the beginning.
         drawn: (B, K) the disturbance's random numbers.
         work: the fields of `Work`.
-        extremes: those of `Extremes`.
+        extremes_before: those of `Extremes`, overwritten with the running maxima at the beginning.
+        extremes: those of `Extremes`, raised.
         held: whether the effect of the inputs has to be computed first.
         low: first environment.
         high: one past the last.
@@ -254,7 +215,8 @@ def step(
     runs, estimates, input_runs, all_drifts = runs_in(n, f), estimates_in(n, f), input_runs_in(n), all_drifts_in(n)
     terms, edges, states, inputs = terms_in(n, f), edges_in(n, f), states_in(n, f), inputs_in(n, f)
     rho, omega, (state_sums, input_sums) = rho_in(n, f), omega_in(n, f), sums_in(n, f)
-    now, before, work, extremes = Values(*now), Values(*before), Work(*work), Extremes(*extremes)
+    now, before, work = Values(*now), Values(*before), Work(*work)
+    extremes, earlier = Extremes(*extremes), Extremes(*extremes_before)
     observed, evaluations = inputs[0].size, 0
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
@@ -262,6 +224,9 @@ def step(
             input_maps(runs, now.x, now.u, now.g, begin, end)
         for e in range(begin, end):
             before.t[e] = now.t[e]
+            earlier.normalized[e], earlier.relative[e] = extremes.normalized[e], extremes.relative[e]
+            earlier.input_normalized[e] = extremes.input_normalized[e]
+            earlier.input_relative[e] = extremes.input_relative[e]
         copy_block(now.x, before.x, begin, end)
         copy_block(now.u, before.u, begin, end)
         copy_block(now.g, before.g, begin, end)
@@ -366,28 +331,3 @@ def step(
                 end,
             )
     return 0, evaluations, -1, -1
-
-
-@inlined
-def predict(
-    runs: Any,
-    all_drifts: bool,
-    input_runs: IntArray,
-    estimate: FloatArray,
-    input_estimate: FloatArray,
-    out: FloatArray,
-    low: int,
-    high: int,
-) -> None:
-    """`Prediction.rate`: f(x_hat) + g_hat."""
-    if not all_drifts:
-        for row in range(out.shape[0]):
-            for e in range(high - low):
-                out[row, place(low + e)] = 0.0
-    drifts(runs, estimate, out, low, high)
-    count = input_runs.size // 3
-    for run in range(count):
-        to, source = input_runs[run], input_runs[count + run]
-        for q in range(input_runs[2 * count + run]):
-            for e in range(high - low):
-                out[to + q, place(low + e)] += input_estimate[source + q, place(low + e)]

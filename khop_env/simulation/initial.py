@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from khop_env.brief import brief
 from khop_env.observers import FloatArray, IntArray
@@ -40,6 +41,17 @@ class InitialSet:
             raise ValueError(f"radius must not be negative; got {radius.min():g} for component {radius.argmin()}")
         object.__setattr__(self, "center", center)
         object.__setattr__(self, "radius", radius)
+
+    def checked(self, x0: ArrayLike, count: int) -> FloatArray:
+        """Initial states (n,) or (count, n) that were given, inside the box or not.
+
+        Raises:
+            ValueError: if they aren't finite, or of another shape.
+        """
+        states, n = np.asarray(x0, dtype=float), len(self.center)
+        if states.shape not in ((n,), (count, n)) or not np.all(np.isfinite(states)):
+            raise ValueError(f"x0 must be finite, of shape ({n},) or ({count}, {n}); got shape {states.shape}")
+        return states
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """One (n,) initial state."""

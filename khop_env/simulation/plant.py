@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from khop_env.compiled import compiled, inlined, place
-from khop_env.elementary import all_finite, weighted_sum
+from khop_env.compiled import compiled, place
+from khop_env.elementary import add_block, all_finite, combine
 from khop_env.observers import FloatArray, PlantState, SolveError
 from khop_env.physics import Fleet, read_only
 from khop_env.physics.disturbance import AttachedDisturbance
@@ -46,6 +46,8 @@ class FleetPlant:
         runs: the fields of `physics.right_hand_sides.Runs` of all agents; None where a model is Python.
         terms: those of `physics.waveforms.TermArrays`; None where a disturbance is Python.
         edges: of the law.
+        threads: that share the batch.
+        ranges: of environments, one for each thread.
     """
 
     def __init__(
@@ -61,12 +63,11 @@ class FleetPlant:
         self.fleet, self.num_envs = fleet, num_envs
         self.disturbance, self.law, self.views = disturbance, law, views
         self.threads = threads or Threads(1)
-        self._ranges = self.threads.ranges(num_envs)
+        self.ranges = self.threads.ranges(num_envs)
         self._limit = fleet.input_limit[:, None] if saturated else None
-        self._rates: tuple[FloatArray, ...] = ()
-        self._stacked = np.zeros((0, fleet.n, num_envs))
+        self._rates = np.zeros((0, fleet.n, num_envs))
         attached = AttachedDisturbance((), fleet) if disturbance is None else disturbance
-        self.runs, self.terms = fleet.runs, getattr(attached, "arrays", None)
+        self.runs, self.terms = fleet.runs, attached.arrays if type(attached) is AttachedDisturbance else None
         edges = None if views is None else views.edge_arrays()
         self.edges = EdgeArrays.none(fleet) if edges is None else edges
         own_law = law is not None and (
@@ -97,7 +98,7 @@ class FleetPlant:
         if self.runs is None or self.terms is None:
             self.rate(state, rates[number])
             np.add(before.t, elapsed, out=state.t)
-            weighted_sum(before.x, weights, tuple(rates[: number + 1]), state.x)
+            combine(before.x, weights, number + 1, rates, state.x, 0, self.num_envs)
             require_finite(state.x, self.fleet)
             return
         arrays = before.t, before.x, state.t, state.x, state.g, rates, self._w.T
@@ -106,17 +107,16 @@ class FleetPlant:
         def part(range_: Range) -> bool:
             return advance_plant(*common, *range_)
 
-        if not all(self.threads.run(part, self._ranges)):
+        if not all(self.threads.run(part, self.ranges)):
             require_finite(state.x, self.fleet)
 
     def rates_of(self, stages: int) -> FloatArray:
         """(stages or more, n, B) x' at the stage before each stage of the last step."""
-        if len(self._stacked) < stages:
+        if len(self._rates) < stages:
             grown = np.zeros((stages, self.fleet.n, self.num_envs))
-            grown[: len(self._stacked)] = self._stacked
-            self._stacked = grown
-            self._rates = tuple(self._stacked)
-        return self._stacked
+            grown[: len(self._rates)] = self._rates
+            self._rates = grown
+        return self._rates
 
     def edge_law(self) -> tuple[Any, ...]:
         """The law's compiled form with its parameters as they are now, the fields of `EdgeLaw`."""
@@ -155,7 +155,7 @@ class FleetPlant:
             self.fleet.input_map(self._t, self._bind(state), self._inputs, self._effects)
             return
         common = self.runs, state.x, state.u, state.g
-        self.threads.run(lambda range_: input_maps(*common, *range_), self._ranges)
+        self.threads.run(lambda range_: input_maps(*common, *range_), self.ranges)
 
     def checked_inputs(self, u: ArrayLike) -> FloatArray:
         """Inputs (m,) or (B, m) that are to be held, checked.
@@ -248,50 +248,6 @@ def advance_plant(
         for e in range(high - low):
             total += 0.0 * x[row, place(low + e)]  # 0, or NaN once and for all
     return total == 0.0
-
-
-@inlined
-def combine(
-    base: FloatArray, weights: FloatArray, count: int, terms: FloatArray, out: FloatArray, low: int, high: int
-) -> None:
-    """Write base + sum of weights[k] terms[k], k below `count`, into the columns low to high - 1 of `out`."""
-    copy_block(base, out, low, high)
-    for k in range(count):
-        weight, term = weights[k], terms[k]
-        if high - low == out.shape[1]:
-            flat, values = out.ravel(), term.ravel()
-            for q in range(flat.size):
-                flat[q] += weight * values[q]
-        else:
-            for row in range(out.shape[0]):
-                for e in range(high - low):
-                    out[row, place(low + e)] += weight * term[row, place(low + e)]
-
-
-@inlined
-def copy_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
-    """Copy the columns low to high - 1; all of them in one long loop."""
-    if high - low == out.shape[1]:
-        flat, source = out.ravel(), values.ravel()
-        for q in range(flat.size):
-            flat[q] = source[q]
-    else:
-        for row in range(out.shape[0]):
-            for e in range(high - low):
-                out[row, place(low + e)] = values[row, place(low + e)]
-
-
-@inlined
-def add_block(values: FloatArray, out: FloatArray, low: int, high: int) -> None:
-    """Add the columns low to high - 1, likewise."""
-    if high - low == out.shape[1]:
-        flat, source = out.ravel(), values.ravel()
-        for q in range(flat.size):
-            flat[q] += source[q]
-    else:
-        for row in range(out.shape[0]):
-            for e in range(high - low):
-                out[row, place(low + e)] += values[row, place(low + e)]
 
 
 def require_finite(x: FloatArray, fleet: Fleet) -> None:

@@ -27,10 +27,9 @@ from khop_env.simulation.compiled_step import compiled_step
 from khop_env.simulation.initial import InitialSet
 from khop_env.simulation.plant import FleetPlant, parts_of_step
 from khop_env.simulation.readings import Readings
-from khop_env.simulation.state import SimulatorState
+from khop_env.simulation.state import SimulatorState, selected
 from khop_env.simulation.step_control import StepControl, StepCount
 from khop_env.simulation.view import OBSERVE, Law, Observe, ViewBuilder
-from khop_env.threads import Threads
 
 _WARM_UP_STEP = 1e-9  # s: short enough for all observers, long enough to run all of their code
 
@@ -90,7 +89,7 @@ class Simulator(Readings):
         self.observers.prepare(design, num_envs, Assumptions(initial.center, initial.radius, pushed))
         self.task_graph = nx.empty_graph(len(self.fleet)) if task is None else task
         views = None if law is None else ViewBuilder(design, self.observers, self.task_graph, observe, num_envs)
-        threads, saturated = Threads(getattr(self.observers, "threads", 1)), self.observers.by_messages
+        threads, saturated = getattr(self.observers, "pool", None), self.observers.by_messages
         self.plant = FleetPlant(self.fleet, num_envs, attached, law, views, saturated=saturated, threads=threads)
         self.state = SimulatorState(
             t=np.zeros(num_envs),
@@ -100,10 +99,10 @@ class Simulator(Readings):
             drawn=np.zeros((num_envs, 0 if attached is None else attached.draws)),
             memory=self.observers.allocate(),
         )
-        self.before, self._interrupted = self.state.copy(), False
-        self._compiled = compiled_step(self.plant, self.observers, self.state, self.before)
-        self._in_one_call = False
+        self.before, self._interrupted, self._in_one_call = self.state.copy(), False, False
         self.running_extremes = Extremes(*(np.zeros(num_envs) for _ in Extremes._fields))
+        self._extremes_before = self.running_extremes.copied()
+        self._compiled = compiled_step(self.plant, self.observers, self.state, self.before, self._extremes_before)
         reach = np.abs(initial.center) + initial.radius
         self.longest_step, self._stiffest = self.fleet.explicit_step(reach, pushed)
         self.reset(seed=0)
@@ -132,12 +131,15 @@ class Simulator(Readings):
                 duplicated or not integers.
             DesignError: for an x0 outside the funnels; nothing has been reset then.
         """
-        chosen = self.env_list(env_ids)
+        chosen = selected(env_ids, self.num_envs)
         seeds = [seed + int(b) for b in chosen] if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != len(chosen):
             raise ValueError(f"expected one seed or {len(chosen)}, one per environment; got {len(seeds)}")
         generators = [np.random.default_rng(each) for each in seeds]  # raises for an invalid seed
-        start = self._initial_states(x0, len(chosen))
+        start = None if x0 is None else self.initial.checked(x0, len(chosen))
+        if start is not None:
+            away = np.abs(start - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
+            self.design.require_feasible_start(away, np.zeros(self.fleet.n))
         state, disturbance = self.state, self.plant.disturbance
         self._interrupted &= len(chosen) < self.num_envs
         for b, rng in zip(chosen, generators, strict=True):
@@ -227,16 +229,15 @@ class Simulator(Readings):
             u: (m, B) physical inputs to hold from now on, batch last and finite, where there is no law.
         """
         self._require_whole()
-        state, copied = self.state, self.observers.copied
         self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
         held = False
         if u is not None:
-            state.u[...] = u
+            self.state.u[...] = u
             held = self._in_one_call and parts == 1  # the compiled step computes their effect itself
             if not held:
-                self.plant.actuate(state)
-        whole = copied or parts > 1  # whether a step that fails can be undone, or only one that fails at its beginning
-        start = state.copy() if parts > 1 else state
+                self.plant.actuate(self.state)
+        whole = self.observers.copied or parts > 1  # otherwise a step can be undone that fails at its beginning only
+        start = (self.state.copy(), self.running_extremes.copied()) if parts > 1 else None
         self._keep()  # not in the block below: where it is interrupted halfway nothing has to be restored
         try:
             for part in range(parts):
@@ -244,10 +245,10 @@ class Simulator(Readings):
                     self._keep()
                 self._one_step(dt / parts, held)
         except BaseException as error:
-            if parts > 1:
-                start.copy_step(state, whole)
-            else:
-                self.take_back(whole)
+            self.take_back(whole)
+            if start is not None:
+                start[0].copy_step(self.state, whole)
+                start[1].copy_to(self.running_extremes)
             self._interrupted = not whole and not isinstance(error, FunnelError | SolveError)
             raise
 
@@ -257,31 +258,30 @@ class Simulator(Readings):
         Where this raises, `take_back` has to follow.
 
         Raises:
-            FunnelError: as `step`; the state is undefined then.
-            SolveError: likewise.
+            FunnelError: as `step`, or `SolveError`; the state is undefined then.
         """
         self._in_one_call = self._compiled is not None and self._compiled.ready(self.running_extremes)
         self._keep()
         self._one_step(dt, False)
 
     def take_back(self, memory: bool = True) -> None:
-        """Return to the state before the last step, wherever that was interrupted.
+        """Return to the state and the extremes before the last step, wherever that was interrupted.
 
         Args:
             memory: whether the observers' memory was copied, too.
         """
         begun = self.before.t == self.before.t  # not where the compiled step was interrupted before it began
-        if begun.all():
-            self.before.copy_step(self.state, memory)
-            return
-        before, ours = self.before.arrays(), self.state.arrays()
-        for name in ours.keys() - {"drawn"}:
-            ours[name][..., begun] = before[name][..., begun]
+        where = True if begun.all() else begun
+        self.before.copy_step(self.state, memory, where)
+        self._extremes_before.copy_to(self.running_extremes, where)
+        if where is not True:
+            self.plant.effect(self.state)  # of inputs that are new in the others
 
     def _keep(self) -> None:
-        """Copy the present state to `before`, unless the compiled step does."""
+        """Note the present state and extremes, unless the compiled step does."""
         if not self._in_one_call:
             self.state.copy_step(self.before, self.observers.copied)
+            self.running_extremes.copy_to(self._extremes_before)
 
     def _one_step(self, dt: float, held: bool) -> None:
         if self._in_one_call:
@@ -306,7 +306,7 @@ class Simulator(Readings):
             pass  # the first real step will raise it again
         finally:
             self.restore(saved)
-            self.running_extremes = extremes
+            extremes.copy_to(self.running_extremes)
 
     def save(self) -> SimulatorState:
         """Everything needed to continue bit for bit."""
@@ -341,37 +341,8 @@ class Simulator(Readings):
             num_envs=num_envs,
         )
 
-    def env_list(self, env_ids: Sequence[int] | IntArray | None) -> IntArray:
-        """Indices of environments, checked; all of them for None.
-
-        Raises:
-            ValueError: if an index is out of range, duplicated, or not an integer.
-        """
-        if env_ids is None:
-            return np.arange(self.num_envs)
-        chosen = np.asarray(env_ids)
-        if chosen.dtype == bool:
-            raise ValueError("env_ids must be indices, not a mask: give np.flatnonzero(mask)")
-        wrong = chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu")
-        if wrong or np.any((chosen < 0) | (chosen >= self.num_envs)) or len(np.unique(chosen)) < len(chosen):
-            raise ValueError(f"env_ids must be different indices from 0 to {self.num_envs - 1}; got {env_ids!r}")
-        return chosen.astype(np.int64)
-
     def _require_whole(self) -> None:
         if self._interrupted:
             raise RuntimeError(
                 "the last step was interrupted half-way: reset all environments, or restore a saved state, to go on"
             )
-
-    def _initial_states(self, x0: ArrayLike | None, count: int) -> FloatArray | None:
-        """Check initial states, before anything is overwritten."""
-        if x0 is None:
-            return None
-        states = np.asarray(x0, dtype=float)
-        if states.shape not in ((self.fleet.n,), (count, self.fleet.n)) or not np.all(np.isfinite(states)):
-            raise ValueError(
-                f"x0 must be finite, of shape ({self.fleet.n},) or ({count}, {self.fleet.n}); got shape {states.shape}"
-            )
-        away = np.abs(states - self.initial.center).reshape(-1, self.fleet.n).max(axis=0)
-        self.design.require_feasible_start(away, np.zeros(self.fleet.n))
-        return states

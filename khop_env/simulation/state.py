@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from khop_env.brief import brief
-from khop_env.observers import FloatArray, Memory
+from khop_env.observers import FloatArray, IntArray, Memory
 
 
 @dataclass(slots=True)
@@ -42,18 +44,19 @@ class SimulatorState:
         t, x, u, g, drawn = (array.copy() for array in (self.t, self.x, self.u, self.g, self.drawn))
         return SimulatorState(t, x, u, g, drawn, memory)
 
-    def copy_step(self, other: SimulatorState, memory: bool = True) -> None:
+    def copy_step(self, other: SimulatorState, memory: bool = True, where: NDArray[np.bool_] | bool = True) -> None:
         """Copy the arrays that a step changes into `other`, of the same shapes: all but the episode's draws.
 
         Args:
             other: changed.
             memory: whether the observers' memory is copied, too.
+            where: (B,) in which environments; True for all.
         """
         for ours, theirs in ((self.t, other.t), (self.x, other.x), (self.u, other.u), (self.g, other.g)):
-            np.copyto(theirs, ours)
+            np.copyto(theirs, ours, where=where)
         if memory:
             for name, values in self.memory.items():
-                np.copyto(other.memory[name], values)
+                np.copyto(other.memory[name], values, where=where)
 
     def assign(self, other: SimulatorState) -> None:
         """Overwrite this state in place; memory of `other` that these observers don't have is left out.
@@ -75,3 +78,20 @@ class SimulatorState:
                 )
         for name, values in ours.items():
             values[...] = theirs[name]
+
+
+def selected(env_ids: Sequence[int] | IntArray | None, num_envs: int) -> IntArray:
+    """Indices of environments, checked; all of them for None.
+
+    Raises:
+        ValueError: if an index is out of range, duplicated, or not an integer.
+    """
+    if env_ids is None:
+        return np.arange(num_envs)
+    chosen = np.asarray(env_ids)
+    if chosen.dtype == bool:
+        raise ValueError("env_ids must be indices, not a mask: give np.flatnonzero(mask)")
+    wrong = chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu")
+    if wrong or np.any((chosen < 0) | (chosen >= num_envs)) or len(np.unique(chosen)) < len(chosen):
+        raise ValueError(f"env_ids must be different indices from 0 to {num_envs - 1}; got {env_ids!r}")
+    return chosen.astype(np.int64)

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from khop_env.compiled import compiled
 from khop_env.network.activity import SLACK, BoolArray
-from khop_env.observers import FloatArray, IntArray, Proximal, SolveError
+from khop_env.observers import FloatArray, Proximal, SolveError
 from khop_env.observers.proximal import TABLEAUS
+from khop_env.simulation.embedded import EMBEDDED, along, by_target, largest_error
 
 if TYPE_CHECKING:
-    from khop_env.observers import PairLayout
     from khop_env.simulation.simulator import Simulator
 
 TOLERANCES = (1e-9, 1.0)
@@ -31,30 +30,6 @@ _MOVED = 0.01  # of 1 + |x|, by which states move in the first step that is trie
 _EXPONENT, _LAST_EXPONENT = 0.7, 0.4
 _SAFETY, _LEAST, _MOST = 0.9, 0.2, 5.0  # of the next step's size over this one's: least and most
 _SMALLEST_ERROR = 1e-4  # of the tolerance: an error of 0 isn't divided by
-
-
-class Embedded(NamedTuple):
-    """A result of an order less inside a step, whose difference from the step's own estimates the error.
-
-    Attributes:
-        explicit: (stages,) weight of each stage's rate in the difference.
-        implicit: (stages,) weight of each stage's correction.
-        inner: number of the rate in the middle of the step that dense output uses.
-        node: its time over the step's.
-    """
-
-    explicit: tuple[float, ...]
-    implicit: tuple[float, ...]
-    inner: int
-    node: float
-
-
-_GAMMA = TABLEAUS[2].nodes[0]
-EMBEDDED = {
-    2: Embedded((-0.5 / _GAMMA, 0.5 / _GAMMA), (-0.5 / (1 - _GAMMA), 0.5 / (1 - _GAMMA)), inner=1, node=_GAMMA),
-    3: Embedded((1.0, 0.0, 3.0, -4.0), (0.0, -6.0, 4.0, 2.0), inner=3, node=0.5),
-}
-"""By order of the step; docs/theory/step.md derives the weights."""
 
 
 class StepCount(NamedTuple):
@@ -123,7 +98,7 @@ class StepControl:
             )
         self.tolerance, self.last, self.accepted, self.rejected = float(tolerance), 0.0, 0, 0
         self.simulator, self._observers, self.embedded = simulator, observers, EMBEDDED[observers.order]
-        self._before, self._extremes = simulator.before, simulator.running_extremes.copied()
+        self._before = simulator.before
         diagonal = TABLEAUS[observers.order].implicit[-1][-1]
         self._weights = np.array(self.embedded.explicit), np.array(self.embedded.implicit), diagonal
         design = simulator.design
@@ -131,11 +106,9 @@ class StepControl:
         self._layouts = design.states.layout, design.inputs.layout
         self._columns = [(each.column_row, each.row_target[each.column_row]) for each in self._layouts]
         ones = np.ones((1, simulator.num_envs))
-        self._fixed_sums = [_by_target(each, each.inverse_row_sums[:, None] * ones) for each in self._layouts]
-        self._planned, self._last_error = (
-            0.0,
-            1.0,
-        )  # the next size; 0 for the shortest, at the start and after a jump
+        self._fixed_sums = [by_target(each, each.inverse_row_sums[:, None] * ones) for each in self._layouts]
+        self._planned = 0.0  # the next size; 0 for the shortest, at the start and after a jump
+        self._last_error = 1.0
 
     def warm_up(self) -> None:
         """Compile what a step needs beside `Simulator.warm_up`."""
@@ -172,10 +145,7 @@ class StepControl:
         Raises:
             SolveError: if a number isn't finite, however short the step; the state is that before it.
         """
-        simulator = self.simulator
         links = None if self._activity is None else self._links().copy()
-        for running, kept in zip(simulator.running_extremes, self._extremes, strict=True):
-            np.copyto(kept, running)
         size, most = self._limited(until), _MOST
         while (smaller := self._tried(size, links, most)) is not None:
             size, most = max(smaller, _SHORTEST), 1.0
@@ -187,7 +157,7 @@ class StepControl:
         try:
             self.simulator.try_step(size)
         except BaseException as failed:
-            self._take_back()
+            self.simulator.take_back()
             if isinstance(failed, SolveError) and size > _SHORTEST:
                 return 0.1 * size
             raise
@@ -198,7 +168,7 @@ class StepControl:
             if changed:
                 assert links is not None
                 shorter = min(shorter, size * self._unchanged(size, links))
-            self._take_back()
+            self.simulator.take_back()
             return shorter
         if changed:
             self._planned, self._last_error = 0.0, 1.0
@@ -215,11 +185,6 @@ class StepControl:
             else:
                 self._planned, self._last_error = grown, error
         return None
-
-    def _take_back(self) -> None:
-        self.simulator.take_back()
-        for running, kept in zip(self.simulator.running_extremes, self._extremes, strict=True):
-            np.copyto(running, kept)
 
     def _limited(self, until: float) -> float:
         """The planned size, but no further than `until`, what the drift takes, and the next change of a link."""
@@ -242,7 +207,7 @@ class StepControl:
     def _error(self, size: float) -> float:
         """The largest estimated error of the step over what is admissible."""
         state, observers, memory = self.simulator.state, self._observers, self.simulator.state.memory
-        return _largest_error(
+        return largest_error(
             size,
             self.tolerance,
             *self._weights,
@@ -268,7 +233,7 @@ class StepControl:
         links = self._observers.links
         assert links is not None
         sums = (links.states, links.inputs)[kind].inverse_row_sums(self._links())
-        return _by_target(self._layouts[kind], sums)
+        return by_target(self._layouts[kind], sums)
 
     def _links(self) -> BoolArray:
         up = self._observers.links_up(self.simulator.state)
@@ -297,79 +262,4 @@ class StepControl:
         """
         rates = self.simulator.plant.rates_of(len(self._weights[0]))
         inner = rates[self.embedded.inner]
-        _along(share, start, size, self.embedded.node, self._before.x, rates[0], inner, self.simulator.state.x, out)
-
-
-def _by_target(layout: PairLayout, sums: FloatArray) -> FloatArray:
-    """(targets, B) maxima of (pairs, B)."""
-    return np.maximum.reduceat(sums, layout.arrays.pair, axis=0) if layout.size else np.zeros((0, sums.shape[1]))
-
-
-@compiled
-def _along(
-    share: FloatArray,
-    start: int,
-    size: float,
-    node: float,
-    x: FloatArray,
-    rate: FloatArray,
-    inner: FloatArray,
-    end: FloatArray,
-    out: FloatArray,
-) -> None:
-    """The polynomial through both ends with the rates at the beginning and at the inner node."""
-    for c in range(x.shape[0]):
-        for k in range(share.size):
-            env, s = min(k, x.shape[1] - 1), share[k]
-            risen, turned = (end[c, env] - x[c, env]) / size - rate[c, env], inner[c, env] - rate[c, env]
-            cubic = (turned - 2.0 * node * risen) / (node * (3.0 * node - 2.0))
-            inside = x[c, env] + s * size * (rate[c, env] + s * (risen - cubic + s * cubic))
-            out[c, start + k] = end[c, env] if s == 1.0 else inside
-
-
-@compiled
-def _largest_error(
-    size: float,
-    tolerance: float,
-    explicit: FloatArray,
-    implicit: FloatArray,
-    diagonal: float,
-    x: FloatArray,
-    rates: FloatArray,
-    row: IntArray,
-    target: IntArray,
-    rho: FloatArray,
-    sums: FloatArray,
-    y: FloatArray,
-    predicted: FloatArray,
-    slopes: FloatArray,
-    input_row: IntArray,
-    input_target: IntArray,
-    omega: FloatArray,
-    input_sums: FloatArray,
-    input_y: FloatArray,
-    input_slopes: FloatArray,
-) -> float:
-    stages, stiff = explicit.size, 4.0 * diagonal * size
-    largest = 0.0
-    for env in range(x.shape[1]):
-        for c in range(x.shape[0]):
-            change = 0.0
-            for s in range(stages):
-                change += explicit[s] * rates[s, c, env]
-            largest = max(largest, abs(change) / (1.0 + abs(x[c, env])))
-        for c in range(y.shape[0]):
-            change = 0.0
-            for s in range(stages):
-                change += explicit[s] * predicted[s, c, env] + implicit[s] * slopes[s, c, env]
-            width = rho[row[c], env]
-            damping = 1.0 + stiff / (width * width * sums[target[c], env])
-            largest = max(largest, abs(change) / (damping * (1.0 + abs(y[c, env]))))
-        for c in range(input_y.shape[0]):
-            change = 0.0
-            for s in range(stages):
-                change += implicit[s] * input_slopes[s, c, env]
-            width = omega[input_row[c], env]
-            damping = 1.0 + stiff / (width * width * input_sums[input_target[c], env])
-            largest = max(largest, size * abs(change) / (damping * (1.0 + abs(input_y[c, env]))))
-    return size * largest / tolerance
+        along(share, start, size, self.embedded.node, self._before.x, rates[0], inner, self.simulator.state.x, out)

@@ -20,8 +20,8 @@ from khop_env.physics import (
     SingleIntegrator,
     SurfaceVessel,
     Unicycle,
-    drifting_integrator_drift,
 )
+from khop_env.physics.right_hand_sides import drifter_drift
 from khop_env.scenarios import mixed_fleet
 from tests.strategies import SEEDS
 
@@ -123,7 +123,7 @@ def test_drifter_is_the_papers_equation(x: np.ndarray) -> None:
 def test_compiled_drift_takes_strided_columns_of_any_size(agents: int, batch: int) -> None:
     x = np.random.default_rng(0).normal(size=(batch, 2 * agents + 3))[:, 3:].T
     out = np.full((2 * agents, 2 * batch), np.nan)[:, ::2]
-    drifting_integrator_drift(x, out)
+    drifter_drift(agents, 0, x, out, 0, batch)
     np.testing.assert_allclose(out[::2], np.tanh(0.5 * x[::2] + 0.5 * x[1::2]), rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(out[1::2], np.sin(0.5 * x[::2] - 0.5 * x[1::2]), rtol=1e-14, atol=1e-15)
 

@@ -115,7 +115,12 @@ def test_tables_and_summary(recording, capsys):
     assert (found["dt"], found["tolerance"], found["rejected_steps"]) == (None, 1e-3, recording.rejected)
     assert found["funnel_kept"]
     print_summary(found, {})
-    assert "steps of tolerance 0.001" in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "2 s in steps of controlled size, tolerance 0.001 (" in printed
+    print_summary({**found, "steps": 9, "rejected_steps": 2, "diverged": True}, {})
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "for 9 steps, and 2 that were taken back" in printed
+    assert "try a smaller --tolerance" in printed
 
 
 def test_changing_links_are_recorded():
@@ -145,6 +150,14 @@ def test_bad_arguments_are_refused(changes, expected):
     arguments = {"duration": 1.0, "tolerance": 1e-3} | changes
     with pytest.raises(ValueError, match=expected):
         record_controlled(simulator(paper()), **arguments)
+
+
+def test_more_steps_than_can_be_taken_are_refused():
+    """Of a drift that takes short ones only."""
+    stiff = simulator(paper())
+    stiff.longest_step = 1e-6
+    with pytest.raises(ValueError, match="until = 1000 s is too far away"):
+        record_controlled(stiff, 1000.0, 1e-3)
 
 
 def test_one_environment_only():

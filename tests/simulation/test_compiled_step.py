@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from agents import FormationLaw, LeaderFollowingLaw, LinearConsensus, TanhConsensus, make_law
 from khop_env.observers import Exponential, Proximal, SolveError
-from khop_env.observers.performance import Scaled
+from khop_env.observers.performance import FunnelBank, Scaled, scaled
 from khop_env.physics import VELOCITY_CONTROLLERS, DriftingIntegrator, Sinusoid
+from khop_env.physics.disturbance import AttachedDisturbance
 from khop_env.scenarios import Scenario, mixed_fleet, paper
 from khop_env.simulation import Simulator, compiled_step
 from tests.strategies import SmoothSignals, System, systems
@@ -35,6 +36,37 @@ class Drifter(DriftingIntegrator):
 
 class Breeze(Sinusoid):
     """A user's disturbance, likewise."""
+
+
+class Halved(AttachedDisturbance):
+    """A disturbance attached to a fleet, likewise."""
+
+    def __call__(self, t, x, drawn, out):
+        """Half of what its base class gives."""
+        return np.multiply(super().__call__(t, x, drawn, out), 0.5, out=out)
+
+
+class HalfSinusoid(Sinusoid):
+    """A disturbance that is attached in a way of its own."""
+
+    form = Sinusoid.form
+
+    def attach(self, fleet):
+        """Halved."""
+        return Halved(self.terms, fleet)
+
+
+@dataclasses.dataclass(frozen=True)
+class Wavy(Exponential):
+    """A user's funnel, with other values than its base class."""
+
+    def __call__(self, t):
+        """Up to 10 % narrower than the exponential."""
+        return super().__call__(t) * (0.95 + 0.05 * np.cos(t))
+
+    def infimum(self):
+        """A tenth below the exponential's."""
+        return 0.9 * super().infimum()
 
 
 def with_a_drifter(scenario: Scenario) -> Scenario:
@@ -96,7 +128,19 @@ def test_a_law_whose_parameters_change_is_followed():
     assert_same_run(compiled, python, 0.02, 3)
 
 
-@pytest.mark.parametrize("owned", ["model", "disturbance", "law", "subclass of a law", "funnel", "controller"])
+@pytest.mark.parametrize(
+    "owned",
+    [
+        "model",
+        "disturbance",
+        "attached disturbance",
+        "law",
+        "subclass of a law",
+        "funnel",
+        "subclass of a funnel",
+        "controller",
+    ],
+)
 def test_what_is_a_users_goes_through_python(owned, monkeypatch):
     """A subclass of a library's class, whose methods may differ, counts as a user's own."""
     scenario, law = paper(), None
@@ -104,6 +148,8 @@ def test_what_is_a_users_goes_through_python(owned, monkeypatch):
         scenario = with_a_drifter(scenario)
     elif owned == "disturbance":
         scenario = dataclasses.replace(scenario, disturbance=scenario.disturbance + Breeze(0.1))
+    elif owned == "attached disturbance":
+        scenario = dataclasses.replace(scenario, disturbance=HalfSinusoid(0.1))
     elif owned == "law":
         law = SmoothSignals(scenario.build().fleet, 0)
     elif owned == "subclass of a law":
@@ -113,7 +159,17 @@ def test_what_is_a_users_goes_through_python(owned, monkeypatch):
         monkeypatch.setitem(VELOCITY_CONTROLLERS, "drifter", lambda model, x, velocity: 0.5 * velocity)
     elif owned == "funnel":
         scenario = dataclasses.replace(scenario, delta=Scaled(Exponential(40.0, 1.0, 1.0), 1.0))
+    elif owned == "subclass of a funnel":
+        scenario = dataclasses.replace(scenario, delta=Wavy(40.0, 1.0, 1.0))
     assert scenario.build(law=law)._compiled is None
+
+
+def test_a_funnel_of_a_class_derived_from_the_librarys_has_its_own_values():
+    bank = FunnelBank([Exponential(4.0, 1.0, 0.5), Wavy(4.0, 1.0, 0.5), scaled(Wavy(4.0, 1.0, 0.5), 2.0)])
+    t = np.array([0.0, 1.0, 3.0])
+    found = bank.evaluate(t, np.zeros((3, 3)))
+    np.testing.assert_allclose(found[1], Wavy(4.0, 1.0, 0.5)(t))
+    np.testing.assert_allclose(found[2], 2.0 * found[1])
 
 
 def test_a_users_model_beside_the_librarys_moves_as_theirs():
@@ -136,11 +192,24 @@ def test_a_step_that_fails_says_why_and_changes_nothing(threads):
     simulator.step(0.02)
     column = next(q for q, (_, name, _) in enumerate(simulator.fleet.component_names()) if name == "surge")
     simulator.state.x[column, 150] = 1e200  # whose quadratic drag overflows
-    saved = simulator.save()
+    saved, extremes = simulator.save(), simulator.extremes
     with pytest.raises(SolveError, match=r"environment 150: state '\w+' of 'vessel_0' became"):
         simulator.step(0.02)
     for name, values in simulator.state.arrays().items():
         np.testing.assert_array_equal(values, saved.arrays()[name], err_msg=name)
+    for ours, theirs in zip(simulator.extremes, extremes, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_inputs_that_are_new_have_their_effect_where_a_step_did_not_begin():
+    """In the environments behind the one that fails, and where Ctrl-C came before the compiled code."""
+    simulator = paper().build(num_envs=300)
+    simulator.warm_up(long=True)
+    u = np.ones((simulator.fleet.m, 300))
+    simulator.state.x[3, 1] = np.nan
+    with pytest.raises(SolveError, match="environment 1:"):
+        simulator.step_unchecked(0.02, 1, u)
+    np.testing.assert_array_equal(simulator.g, u.T)  # of drifters
 
 
 def test_it_is_compiled_where_it_has_been_before_or_in_long_runs_only(monkeypatch):

@@ -1,6 +1,8 @@
 """Steps of controlled size: errors follow the tolerance; every funnel is kept, also in steps that are taken back."""
 
+import copy
 import dataclasses
+import pickle
 
 import networkx as nx
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import make_law
+from agents import TanhConsensus, make_law
 from khop_env.network import Outage, Range, Switching
 from khop_env.observers import Explicit, Exponential, Extremes, Networked, ObserverDesign, Proximal, SolveError
 from khop_env.physics import DoubleIntegrator, Fleet, SingleIntegrator, SurfaceVessel
@@ -312,3 +314,17 @@ def test_environments_at_different_times_are_refused():
 def test_the_present_is_reached_without_a_step():
     simulator = held()
     assert simulator.advance(float(simulator.t[0]), tolerance=1e-3) == (0, 0)
+
+
+@pytest.mark.parametrize("in_python", [False, True])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda simulator: pickle.loads(pickle.dumps(simulator))])
+def test_copies_take_the_same_steps(copied, in_python):
+    """Errors are estimated from arrays of the copy's own, whichever code filled them."""
+    simulator = paper().build(law=TanhConsensus(), observers=Proximal(3), num_envs=2)
+    if in_python:
+        simulator._compiled = None
+    simulator.step(0.02)
+    twin = copied(simulator)
+    counts = [each.advance(0.5, tolerance=1e-4) for each in (simulator, twin)]
+    assert counts[0] == counts[1]
+    assert_same(simulator.state, twin.state)

@@ -1,6 +1,6 @@
-"""The equations of a compiled step, packed into two arrays, and how compiled code finds its way in them.
+"""The arrays of a compiled step, as few arguments, and how compiled code finds its way in them.
 
-Every argument of a compiled call takes time, some 50 ns an array, and these are more than 60.
+Every argument of a compiled call takes time, some 50 ns an array; the equations alone are more than 60.
 """
 
 from __future__ import annotations
@@ -11,6 +11,65 @@ import numpy as np
 
 from khop_env.compiled import pasted
 from khop_env.observers import FloatArray, IntArray
+from khop_env.simulation.state import SimulatorState
+
+
+class Values(NamedTuple):
+    """The arrays of a `SimulatorState` that a step changes.
+
+    Attributes:
+        t: (B,) time in s.
+        x: (n, B) states.
+        u: (m, B) inputs.
+        g: (n, B) their effect.
+        estimate: (P, B) estimates of states.
+        input_estimate: (Q, B) estimates of the inputs' effects.
+        eps: (P, B) transformed disagreements.
+        nu: (Q, B) those of the input observers.
+    """
+
+    t: FloatArray
+    x: FloatArray
+    u: FloatArray
+    g: FloatArray
+    estimate: FloatArray
+    input_estimate: FloatArray
+    eps: FloatArray
+    nu: FloatArray
+
+    @classmethod
+    def of(cls, state: SimulatorState) -> Values:
+        """Of a state; its arrays themselves."""
+        memory = (state.memory[name] for name in ("estimate", "input_estimate", "eps", "nu"))
+        return cls(state.t, state.x, state.u, state.g, *memory)
+
+
+class Work(NamedTuple):
+    """Arrays that a step fills: the stages' rates, and scratch.
+
+    Attributes:
+        rates: (stages, n, B) x' at the stage before.
+        predicted: (stages, P, B) f(x_hat) + g_hat there.
+        slopes: (stages, P, B) corrections of the state observers at the stage.
+        input_slopes: (stages, Q, B) those of the input observers.
+        w: (n, B) disturbance.
+        rho: (rows, B) funnels of the state observers.
+        omega: those of the input observers.
+        terms: (E, d, B) of the law.
+        velocity: (N * d, B) likewise.
+        drift: (n, B) likewise.
+    """
+
+    rates: FloatArray
+    predicted: FloatArray
+    slopes: FloatArray
+    input_slopes: FloatArray
+    w: FloatArray
+    rho: FloatArray
+    omega: FloatArray
+    terms: FloatArray
+    velocity: FloatArray
+    drift: FloatArray
 
 
 class System(NamedTuple):
