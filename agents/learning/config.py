@@ -122,7 +122,11 @@ class TrainingConfig:
             object.__setattr__(self, "shield", str(self.shield))
             safety_filter(str(self.shield), None)
         if self.residual is not None:
-            make_script(self.residual)
+            script = make_script(self.residual)
+            if getattr(script, "needs_bounds", False) and not self.bounds:
+                raise ValueError(
+                    f"residual {self.residual!r} reads the guaranteed bounds: train with them, bounds=True or --bounds"
+                )
         for name in ("observe", "bounds", "num_envs", "scenario"):
             if name in self.arguments:
                 raise ValueError(f"arguments: {name!r} is a setting of its own, {name}={self.arguments[name]!r}")
