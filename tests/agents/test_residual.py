@@ -8,6 +8,7 @@ import pytest
 
 from agents import make_policy, shielded
 from agents.learning import LearnedPolicy, PolicyFileError, TrainingConfig
+from agents.learning.checkpoint import read_checkpoint, restored, write_checkpoint
 from agents.learning.environment import WHOLE, build, described, training_environment
 from agents.learning.policy_file import read_policy, write_policy
 from agents.learning.residual import Script
@@ -119,6 +120,40 @@ def test_the_learner_acts_on_top_of_the_script():
         own = np.stack(list(acted.values()), axis=1).reshape(env.num_envs, -1)
         env.step(np.full_like(own, added))
         np.testing.assert_array_equal(sent[-1], np.clip(own + np.float32(added), -1.0, 1.0))
+
+
+def test_the_script_learns_of_ends_in_training():
+    """Of those environments whose episodes have ended, staggered as they are."""
+    env = training_environment(config("navigation_v0", "orca", arguments={"max_cycles": 8}))
+    env.reset()
+    learner, begun, ended = env.venv, [], []
+    learner.script.begin = begun.append
+    for _ in range(8):
+        *_, done, _ = env.step(np.zeros((env.num_envs, 2), np.float32))
+        if done.any():
+            ended.append(np.unique(np.flatnonzero(done) // len(learner.batched.agents)).tolist())
+    assert [ids.tolist() for ids in begun] == ended
+    assert sorted(number for each in ended for number in each) == [0, 1, 2, 3]
+    assert len(ended) == 4
+
+
+@pytest.mark.parametrize("script", ["keep_right", "orca", "tanh"])
+def test_a_checkpoint_has_what_a_script_remembers(script, tmp_path):
+    """Agents that don't move are stuck: `keep_right` then draws detours."""
+    chosen = config("consensus_v0" if script == "tanh" else "navigation_v0", script, arguments={"network": "wifi"})
+    env = build(chosen, 2)
+    rows = env.reset(0)[0].reshape(2 * len(env.agents), -1)
+    first, second, other = (Script(script, describe(env), 2) for _ in range(3))
+    for each, seed in ((first, 0), (second, 5), (other, 5)):
+        each.reset(seed)
+    for _ in range(25):
+        first.act(rows)
+    write_checkpoint(tmp_path / "state.npz", {"script": first.get_state()})
+    second.set_state(restored(second.get_state(), read_checkpoint(tmp_path / "state.npz")["script"], "script"))
+    ours, theirs, others = (np.stack([each.act(rows) for _ in range(30)]) for each in (first, second, other))
+    np.testing.assert_array_equal(ours, theirs)
+    assert script != "keep_right" or not np.array_equal(ours, others)
+    assert script != "tanh" or first.get_state()["time"].tolist() == pytest.approx([55 * 0.05] * 2)
 
 
 def test_sac_acts_within_the_limits_in_training():
