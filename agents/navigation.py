@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from agents.policy import EnvDescription, Observations, require_description, req
 from agents.scripted import Reader
 from agents.velocity_law import VELOCITY_INPUTS
 from khop_env.env.layout import Float32Array
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import AgentModel, Fleet, velocity_to_input
 
 GAIN = 5.0  # 1/s, where the input is a velocity
@@ -21,6 +22,7 @@ TURN_GAIN = 4.0  # 1/s
 RANGE = 1.5  # m: others that are farther don't matter
 TURN = 2.0  # most that another turns an agent, as the tangent of the angle
 STUCK = 0.05  # m
+_REMEMBERED = ("past", "detour", "left", "generators")  # of KeepRight
 SLOW_NEAR = 0.15  # m: from its goal an agent with a slow gain may be held by a disturbance
 
 
@@ -152,6 +154,28 @@ class KeepRight(GoToGoal):
         aside = left > 0.0
         left -= self._period
         return np.where(aside[:, None], detour, way)
+
+    def begin(self, batch: int, env_ids: IntArray | None = None) -> None:
+        """New episodes have begun in these of `batch` environments; None for all."""
+        if env_ids is None:
+            shape = batch, 2
+            self._past = {agent: [np.full(shape, np.nan) for _ in range(self._second)] for agent in self._past}
+            self._detour = {agent: np.zeros(shape) for agent in self._detour}
+            self._left = {agent: np.full(batch, -1.0) for agent in self._left}
+            return
+        for agent, past in self._past.items():
+            for position in past:
+                position[env_ids] = np.nan  # hasn't moved by less than any length
+            self._detour[agent][env_ids], self._left[agent][env_ids] = 0.0, -1.0
+
+    def get_state(self) -> dict[str, Any]:
+        """What it remembers between actions: positions in the last second, detours, and its generators."""
+        return {name: getattr(self, f"_{name}") for name in _REMEMBERED}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `get_state()`'s result, after a reset in the same environment."""
+        for name in _REMEMBERED:
+            setattr(self, f"_{name}", state[name])
 
 
 def require_plane(name: str, env: EnvDescription) -> None:

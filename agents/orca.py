@@ -7,7 +7,8 @@ Source: J. van den Berg, S. J. Guy, M. Lin and D. Manocha, Reciprocal n-Body Col
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -112,6 +113,24 @@ class Orca(GoToGoal):
             else:
                 self._last[agent] = velocity_to_input(model, x, velocity)
         return dict(self._last)
+
+    def begin(self, batch: int, env_ids: IntArray | None = None) -> None:
+        """New episodes have begun in these of `batch` environments; None for all."""
+        self._others.begin(batch, env_ids)
+        if env_ids is None:
+            self._last = {agent: np.zeros((batch, model.m)) for agent, model, _ in self._agents()}
+            return
+        for last in self._last.values():
+            last[env_ids] = 0.0
+
+    def get_state(self) -> dict[str, Any]:
+        """What it remembers between actions: its last inputs, and what arrived of others."""
+        return {"last": self._last, "others": self._others.get_state()}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `get_state()`'s result, after a reset in the same environment."""
+        self._last = dict(state["last"])
+        self._others.set_state(state["others"])
 
 
 def bodies_of(env: EnvDescription) -> tuple[IntArray, IntArray]:

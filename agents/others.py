@@ -14,7 +14,7 @@ from agents.velocity_law import VELOCITY_INPUTS
 from khop_env.compiled import compiled
 from khop_env.env import ObservationLayout
 from khop_env.env.layout import Float32Array
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, IntArray
 from khop_env.physics import AgentModel, DriftingIntegrator
 
 HELD = ("integrator", "unicycle")  # types of agents whose last position is held until another arrives
@@ -112,10 +112,15 @@ class Others:
             setattr(self, attribute, state[name].copy())
         self._now = float(state["now"])
 
-    def begin(self, batch: int) -> None:
-        """Episodes of a batch begin: nothing is known."""
-        self._now = 0.0
-        self._allocate(batch)
+    def begin(self, batch: int, env_ids: IntArray | None = None) -> None:
+        """Episodes begin in these of `batch` environments, None for all: nothing is known."""
+        if env_ids is None:
+            self._now = 0.0
+            self._allocate(batch)
+            return
+        for values in (self.velocity, self.ahead, self._place):
+            values[env_ids] = 0.0
+        self._stamp[env_ids] = self._time[env_ids] = -math.inf
 
     def _allocate(self, batch: int) -> None:
         pairs = len(self.valid)

@@ -13,6 +13,7 @@ from agents.policy import EnvDescription, Observations, require_description, req
 from agents.tuned import sampled_gain, tuned_parameters
 from agents.velocity_law import VelocityLaw
 from khop_env.env.layout import Float32Array
+from khop_env.observers import IntArray
 from khop_env.physics import Fleet
 from khop_env.scenarios import LawChoice
 from khop_env.simulation import View
@@ -106,7 +107,7 @@ class LawPolicy:
         self.law = make_law(LawChoice(self.name, {**tuned, **self.parameters}))
         if isinstance(self.law, VelocityLaw) and hasattr(self.law, "gain") and "gain" not in self.parameters:
             self.law.gain = sampled_gain(self.law.gain, self.law.averages, env)
-        self._env, self._time = env, 0.0
+        self._env, self._time = env, np.zeros(1)
         self._view: View | None = None
         self._fleet = Fleet(list(env.models.values()))
         self._reader = Reader(env, self._fleet)
@@ -120,8 +121,8 @@ class LawPolicy:
             axis=1,
         )
         self._view = self._reader.view(flat, self._view)
-        inputs = self.law(np.full(len(flat), self._time), self._view)
-        self._time += self._env.control_period
+        inputs = self.law(np.zeros(len(flat)) + self._time, self._view)
+        self._time = self._time + self._env.control_period
         fractions = (inputs / self._fleet.input_limit).astype(np.float32)
         actions = {}
         for number, (agent, size) in enumerate(self._env.action_sizes.items()):
@@ -130,6 +131,20 @@ class LawPolicy:
             actions[agent][:, : own.shape[1]] = own
             actions[agent] = actions[agent].reshape(*shape, size)
         return actions
+
+    def begin(self, batch: int, env_ids: IntArray | None = None) -> None:
+        """New episodes have begun in these of `batch` environments; None for all."""
+        time = np.zeros(batch) + self._time
+        time[slice(None) if env_ids is None else env_ids] = 0.0
+        self._time = time
+
+    def get_state(self) -> dict[str, Any]:
+        """What it remembers between actions: times since the beginnings of the episodes."""
+        return {"time": self._time}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `get_state()`'s result, after a reset in the same environment."""
+        self._time = state["time"]
 
 
 class Reader:

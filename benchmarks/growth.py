@@ -9,6 +9,7 @@ import gc
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -102,8 +103,15 @@ def _growth_of(kind: _Kind, sizes: tuple[int, ...], add: Callable[..., None], ro
         add(f"{kind.prefix}making_{sizes[-1]}", making, "s", most=LONGEST)
 
 
+_PROGRAM = types.ModuleType, type, types.FunctionType
+"""Types of objects that belong to the program, through which everything is reached."""
+
+
 def held_memory(roots: Iterable[object], besides: Iterable[object]) -> int:
-    """Bytes of all objects that `roots` lead to, arrays included, without those that `besides` lead to."""
+    """Bytes of all objects that `roots` lead to, arrays included, without those that `besides` lead to.
+
+    Modules, classes and functions aren't followed.
+    """
     seen = {id(each): each for each in _reached(besides, {})}
     return sum(sys.getsizeof(each) for each in _reached(roots, seen))
 
@@ -113,7 +121,7 @@ def _reached(roots: Iterable[object], seen: dict[int, object]) -> Iterable[objec
     waiting = list(roots)
     while waiting:
         each = waiting.pop()
-        if id(each) in seen:
+        if id(each) in seen or issubclass(type(each), _PROGRAM):  # isinstance would ask proxies what they stand for
             continue
         seen[id(each)] = each
         yield each

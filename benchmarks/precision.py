@@ -31,7 +31,7 @@ from khop_env.registry import scenario
 from khop_env.scenarios import Scenario
 from khop_env.simulation import Simulator, StepControl
 from khop_env.simulation.edge_law import command_inputs
-from khop_env.simulation.packed_system import (
+from khop_env.simulation.packing import (
     Values,
     Work,
     all_drifts_in,

@@ -145,6 +145,26 @@ def test_sac_has_settings_of_its_own(folder):
     assert found["folder"] == "runs/train/consensus_v0-estimate-sac-0"
 
 
+def test_on_top_of_a_script(folder):
+    """Its policy is played by every command; untrained it does what the script does."""
+    command = ("train", "consensus_v0", "--config", "tiny.toml", "--residual", "tanh:gain=3", "--json")
+    found = only_json(khop(*command, "--set", "learning_rate=1e-9"))
+    assert found["folder"] == "runs/train/consensus_v0-estimate-residual-tanh_gain_3-ppo-0"
+    assert 'residual = "tanh:gain=3"' in (folder / found["folder"] / "config.toml").read_text()
+    assert found["curve"][0]["timesteps"] == 0
+    policies = f"ppo:{found['folder']},tanh:gain=3,zero"
+    played = only_json(khop("evaluate", "consensus_v0", "--policies", policies, "--episodes", "2", "--json"))
+    ours, script, zero = (row["mean_return"] for row in played["rows"] if row["observe"] == "estimate")
+    assert ours == pytest.approx(script, rel=1e-3)
+    assert abs(zero) > 2.0 * abs(script)
+    filmed = only_json(khop("run", "paper", "--controller", f"ppo:{found['folder']}", "--duration", "1", "--json"))
+    assert filmed["return"] < 0.0
+    assert "no scripted policy 'tahn' to learn on top of; did you mean 'tanh'?" in refused(
+        "train", "consensus_v0", "--residual", "tahn"
+    )
+    assert "keep_right" in refused("train", "consensus_v0", "--residual", "keep_right")
+
+
 def test_an_argument_that_is_a_setting_is_refused():
     with pytest.raises(ValueError, match="arguments: 'bounds' is a setting of its own, bounds=True"):
         TrainingConfig("consensus_v0", arguments={"bounds": True})

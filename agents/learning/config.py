@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agents.learning.fingerprint import plain
+from agents.learning.residual import make_script
 from khop_env.network import Network
 from khop_env.registry import Environment, find_task
 from khop_env.scenarios import Scenario
@@ -55,6 +56,8 @@ class TrainingConfig:
         intervention: taken from the training reward for every metre by which the shield changes an agent's way.
         saturation: taken from the training reward per second for the squared excess of actions over [-1, 1], beyond
             which exploration has no effect; 0 for none.
+        residual: a scripted policy, with parameters as in `agents.make_policy`, to whose actions the networks add
+            theirs; nothing at the beginning. None for networks alone.
         initial: folder of another run, of which policy, value function and exploration are taken on, or a policy's
             file; None for random networks.
         algorithm: learning algorithm, "ppo" or "sac".
@@ -89,6 +92,7 @@ class TrainingConfig:
     shield: str | float | None = None
     intervention: float = 0.0
     saturation: float = 0.0
+    residual: str | None = None
     initial: str | None = None
     algorithm: Algorithm = "ppo"
     per_type: bool = False
@@ -117,6 +121,12 @@ class TrainingConfig:
 
             object.__setattr__(self, "shield", str(self.shield))
             safety_filter(str(self.shield), None)
+        if self.residual is not None:
+            script = make_script(self.residual)
+            if getattr(script, "needs_bounds", False) and not self.bounds:
+                raise ValueError(
+                    f"residual {self.residual!r} reads the guaranteed bounds: train with them, bounds=True or --bounds"
+                )
         for name in ("observe", "bounds", "num_envs", "scenario"):
             if name in self.arguments:
                 raise ValueError(f"arguments: {name!r} is a setting of its own, {name}={self.arguments[name]!r}")

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from agents.evaluation import chosen_scenario
 from agents.learning.config import TrainingConfig
+from agents.learning.residual import Script
 from agents.learning.scaling import MOST, ObservationScaler
 from agents.learning.shielded import ShieldedSB3VecEnv
 from agents.policies import needs, safety_filter
@@ -43,6 +44,7 @@ def build(config: TrainingConfig, num_envs: int | None = None) -> BatchedEnv:
 
 
 WIDE = 4.0  # actions of a learner whose excess over [-1, 1] counts
+WHOLE = 2.0  # actions of a learner that can take a script's full input to the opposite one
 
 
 class TrainingVecEnv(VecEnvWrapper):
@@ -54,16 +56,23 @@ class TrainingVecEnv(VecEnvWrapper):
         venv: the environment.
         scaler: computes the features.
         config: its `huber`, `intervention` and `saturation` say how rewards are changed.
+        script: acts beside the learner, whose actions are added to its own; None for none.
     """
 
     def __init__(
-        self, venv: KHopSB3VecEnv | ShieldedSB3VecEnv, scaler: ObservationScaler, config: TrainingConfig
+        self,
+        venv: KHopSB3VecEnv | ShieldedSB3VecEnv,
+        scaler: ObservationScaler,
+        config: TrainingConfig,
+        script: Script | None = None,
     ) -> None:
         actions = venv.action_space
-        if config.saturation:  # Stable-Baselines3 clips actions to their space: a wider one shows how far they go
-            actions = Box(-WIDE, WIDE, actions.shape, np.float32)
+        if config.algorithm != "sac" and (config.saturation or script):
+            # PPO's actions are clipped to their space: a wider one shows how far they go; SAC's would be stretched
+            most = WIDE if config.saturation else WHOLE
+            actions = Box(-most, most, actions.shape, np.float32)
         super().__init__(venv, Box(-MOST, MOST, (scaler.size,), np.float32), actions)
-        self.batched, self.scaler, self._config = venv.batched, scaler, config
+        self.batched, self.scaler, self.script, self._config = venv.batched, scaler, script, config
         self.shield = venv if isinstance(venv, ShieldedSB3VecEnv) else None
         self.source: KHopSB3VecEnv = venv.venv if isinstance(venv, ShieldedSB3VecEnv) else venv  # type: ignore[assignment]
         self.before = np.zeros(0, np.float32)  # observations of the previous step
@@ -72,18 +81,21 @@ class TrainingVecEnv(VecEnvWrapper):
     def reset(self) -> Float32Array:
         """Start new, staggered episodes; features (num_envs * N, size)."""
         self.before = np.asarray(self.venv.reset())
+        if self.script is not None:
+            self.script.reset(self._config.seed)
         state, horizon = self.batched.get_state(), self.batched.settings.horizon
         staggered = np.arange(self.batched.num_envs) * horizon // self.batched.num_envs
         self.batched.set_state(dataclasses.replace(state, cycles=staggered))
         return self.scaler(self.before, None)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions (rows, m)."""
+        """Take the actions (rows, m), with the script's added to them."""
+        if self.script is not None:
+            actions = actions + self.script.act(self.before)
+        inside = np.clip(actions, -1.0, 1.0)
         if self._config.saturation:
-            inside = np.clip(actions, -1.0, 1.0)
             self._excess = np.square(actions - inside, dtype=float).sum(axis=1).reshape(self.batched.num_envs, -1)
-            actions = inside
-        self.venv.step_async(actions)
+        self.venv.step_async(inside)
 
     def step_wait(self) -> tuple[Float32Array, Float32Array, np.ndarray, list[dict[str, Any]]]:
         """Advance by one control period; features, robust rewards, dones and infos, one row per agent."""
@@ -104,6 +116,8 @@ class TrainingVecEnv(VecEnvWrapper):
                 infos[row]["terminal_observation"] = features
             before = before.copy()
             before[rows] = current[rows]  # a new episode: no change yet
+            if self.script is not None:
+                self.script.begin(np.flatnonzero(np.reshape(done, (self.batched.num_envs, -1)).any(axis=1)))
         self.before = current
         return self.scaler(current, before), softened.reshape(-1).astype(np.float32), done, infos
 
@@ -115,8 +129,10 @@ def training_environment(config: TrainingConfig) -> VecNormalize:
     rows: KHopSB3VecEnv | ShieldedSB3VecEnv = inner
     if config.shield is not None:
         rows = ShieldedSB3VecEnv(inner, safety_filter(str(config.shield), None, config.bounds))
-    scaler = ObservationScaler.of(described(batched, config), config.rates, config.nearest)
-    wrapped = TrainingVecEnv(rows, scaler, config)
+    found = described(batched, config)
+    scaler = ObservationScaler.of(found, config.rates, config.nearest)
+    script = None if config.residual is None else Script(config.residual, found, batched.num_envs)
+    wrapped = TrainingVecEnv(rows, scaler, config, script)
     return VecNormalize(wrapped, norm_obs=False, norm_reward=True, gamma=config.gamma)
 
 
@@ -124,11 +140,13 @@ def described(batched: BatchedEnv, config: TrainingConfig) -> EnvDescription:
     """An environment that `build` made, as the learner gets it.
 
     Raises:
-        ValueError: if the safety filter, where there is to be one, doesn't fit it.
+        ValueError: if the safety filter or the script, where there are to be such, doesn't fit it.
     """
     found = describe(batched)
-    if config.shield is None:
-        return found
-    shield = safety_filter(str(config.shield), None, config.bounds)
-    shield.reset(found, [0])
-    return shield.inside
+    if config.shield is not None:
+        shield = safety_filter(str(config.shield), None, config.bounds)
+        shield.reset(found, [0])
+        found = shield.inside
+    if config.residual is not None:
+        Script(config.residual, found, 1)
+    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from agents.learning.policy_file import Layers, PolicyFileError, read_policy, write_policy
+from agents.learning.residual import make_script
 from agents.learning.scaling import RATE, ObservationScaler
-from agents.policy import EnvDescription, Observations, require_description, require_reset
+from agents.policy import EnvDescription, Observations, Policy, require_description, require_reset
 from khop_env.env.layout import Float32Array
 
 PRETRAINED = Path(__file__).with_name("pretrained")
@@ -22,6 +23,9 @@ PRETRAINED = Path(__file__).with_name("pretrained")
 @dataclass(eq=False)
 class LearnedPolicy:
     """Networks from features of observations to actions; deterministic, with the previous observation as only memory.
+
+    What was trained on top of a script (`about["residual"]`) adds its outputs to the script's actions, and clips the
+    sum to [-1, 1]; the script may remember more and draw random numbers.
 
     If episodes of a batch end at different times, as with autoreset, the first rates of change after an end span both
     episodes; `reset` drops the previous observation.
@@ -45,6 +49,11 @@ class LearnedPolicy:
     about: Mapping[str, Any]
     _types: dict[str, str] = field(default_factory=dict, init=False, repr=False)
     _before: Float32Array | None = field(default=None, init=False, repr=False)
+    _script: Policy | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        spec = self.about.get("residual")
+        self._script = None if spec is None else make_script(spec)
 
     def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
         """Check that the policy fits the environment's observations and actions.
@@ -93,6 +102,8 @@ class LearnedPolicy:
                 stacklevel=1,  # this line, so that it is said once
             )
         self._types, self._before = {agent: model.type for agent, model in env.models.items()}, None
+        if self._script is not None:
+            self._script.reset(env, seeds)
 
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         """Actions (..., action_size) in [-1, 1] by agent."""
@@ -105,13 +116,18 @@ class LearnedPolicy:
             )
         features = self.scaler(stacked, before)
         self._before = stacked
-        if "" in self.networks:
-            return dict(zip(observations, self._forward(features, self.networks[""]), strict=True))
-        if not self._types:
+        if not self._types and (self._script is not None or "" not in self.networks):
             raise ValueError("LearnedPolicy knows no environment yet: call reset(describe(env), seeds) first")
+        outputs: Iterable[Float32Array]
+        if "" in self.networks:
+            outputs = self._forward(features, self.networks[""])
+        else:
+            kinds = [self._types[agent] for agent in observations]
+            outputs = [self._forward(row, self.networks[kind]) for kind, row in zip(kinds, features, strict=True)]
+        script = {} if self._script is None else self._script.act(observations)
         return {
-            agent: self._forward(row, self.networks[self._types[agent]])
-            for agent, row in zip(observations, features, strict=True)
+            agent: np.clip(output + script[agent] if script else output, -1.0, 1.0)
+            for agent, output in zip(observations, outputs, strict=True)
         }
 
     def _forward(self, values: Float32Array, layers: Layers) -> Float32Array:
@@ -119,7 +135,7 @@ class LearnedPolicy:
             values = values @ weight.T + bias
             if number < len(layers) - 1:
                 np.maximum(values, 0.0, out=values)
-        return np.tanh(values) if self.squash else np.clip(values, -1.0, 1.0)
+        return np.tanh(values) if self.squash else values
 
     def save(self, path: Path) -> None:
         """Write the policy into one .npz file."""
@@ -140,7 +156,11 @@ class LearnedPolicy:
             path = path / "best.npz"
         if not path.exists():
             raise PolicyFileError(f"no policy file {path}; khop train writes a folder with best.npz and last.npz")
-        return cls(**read_policy(path))
+        fields = read_policy(path)
+        try:
+            return cls(**fields)
+        except ValueError as error:
+            raise PolicyFileError(f"{path} can't be played: {error}") from error
 
 
 class PretrainedPolicy:

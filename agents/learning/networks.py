@@ -82,7 +82,7 @@ class PerTypePolicy(ActorCriticPolicy):
 
 
 def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
-    """PPO or SAC with the run's settings.
+    """PPO or SAC with the run's settings; on top of a script their actions are 0 before training, but for exploration.
 
     Args:
         config: the settings.
@@ -90,6 +90,15 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
         types: columns of the one-hot of agent types.
         log: folder for TensorBoard, or None for no log.
     """
+    model = _model(config, env, types, log)
+    if config.residual is not None:
+        last: Any = model.policy.actor.mu if isinstance(model, SAC) else model.policy.action_net
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+    return model
+
+
+def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
     common: dict[str, Any] = {"seed": config.seed, "gamma": config.gamma, "tensorboard_log": log, "device": "cpu"}
     net: dict[str, Any] = {"activation_fn": nn.ReLU}
     if config.algorithm == "sac":

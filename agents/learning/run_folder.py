@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any
 
 import filelock
 
+import khop_env
 from agents.learning.checkpoint import CheckpointError, read_checkpoint
 from agents.learning.config import TrainingConfig
 
@@ -53,6 +56,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "nearest": False,
         "shield": None,
         "intervention": 0.0,
+        "residual": None,
         "initial": None,
         **stored,
     }  # of earlier versions
@@ -70,3 +74,9 @@ def write(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.part")
     partial.write_text(text, encoding="utf-8")
     partial.replace(path)
+
+
+def versions() -> dict[str, str]:
+    """Of what a policy is trained with, by name."""
+    found = {name: importlib.metadata.version(name) for name in ("stable_baselines3", "torch", "numpy", "gymnasium")}
+    return {"khop_env": khop_env.__version__, "python": platform.python_version(), **found}

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import json
-import platform
 import signal
 import threading
 import time
@@ -22,7 +20,6 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-import khop_env
 from agents.evaluation import chosen_scenario, play
 from agents.learning.checkpoint import CheckpointError, model_state, restore_model, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
@@ -32,7 +29,7 @@ from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.initial import begin_from
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
-from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, write
+from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
 from agents.policies import safety_filter
 from agents.policy import EnvDescription, Observations, Policy
 from khop_env.env.layout import Float32Array
@@ -145,6 +142,8 @@ class _Run(BaseCallback):
         self.learner: TrainingVecEnv = self.env.venv  # type: ignore[assignment]
         self.batched = batched = self.learner.batched
         self.fingerprint = fingerprint(chosen_scenario(config.environment, config.scenario), batched)
+        if script := self.learner.script:
+            self.fingerprint["script"] = script.name  # shipped tuned parameters may change
         if saved is not None and (text := differences(saved["fingerprint"], self.fingerprint)):
             raise ValueError(
                 f"{folder} holds a run in another environment: {text}; resume it with the unchanged scenario, or "
@@ -155,8 +154,8 @@ class _Run(BaseCallback):
         self.types = list(dict.fromkeys(model.type for model in batched.fleet.models))
         layout = self.description.layouts[batched.agents[0]]  # the first features are the observation's columns
         columns = [layout.index(f"own.type.{kind}") for kind in self.types]
-        log = None if folder is None else str(folder / "tensorboard")
         self.interrupted, self.resumed = False, saved is not None
+        log = None if folder is None else str(folder / "tensorboard")
         self.algorithm = make_model(config, self.env, columns, log)  # this seeds the environment as well
         self.env.seed((config.seed + 1) * _FIRST_SEED)
         self.curve: list[Evaluation] = []
@@ -202,6 +201,9 @@ class _Run(BaseCallback):
     def _on_training_start(self) -> None:
         if not self.resumed:
             self._save()  # so that a run can be resumed after an early interrupt
+        if self.learner.script and not self.algorithm.num_timesteps:
+            self._evaluate()  # the script, so that the best policy isn't worse
+            self._save()
 
     def _on_step(self) -> bool:
         return not self.interrupted
@@ -270,11 +272,11 @@ class _Run(BaseCallback):
             "environment": self.description.environment,
             "scenario": self.description.scenario,
             "trained": self.algorithm.num_timesteps,
-            "versions": _versions(),
+            "residual": self.learner.script and self.learner.script.name,
+            "versions": versions(),
         }
-        columns = columns_of(self.description)
-        environment = self.description.environment
-        return exported(self.algorithm, self.config, environment, columns, self.types, self.learner.scaler, about)
+        env, columns = self.description.environment, columns_of(self.description)
+        return exported(self.algorithm, self.config, env, columns, self.types, self.learner.scaler, about)
 
     def _save(self) -> None:
         if self.folder is None:
@@ -289,9 +291,9 @@ class _Run(BaseCallback):
         write_checkpoint(self.folder / CHECKPOINT, self._checkpoint())
 
     def _write_config(self, folder: Path) -> None:
-        text = {**self.config.as_dict(), "versions": _versions(), "agents": len(self.batched.agents)}
+        text = {**self.config.as_dict(), "versions": versions(), "agents": len(self.batched.agents)}
         write(folder / "config.json", json.dumps(text, indent=2) + "\n")
-        write(folder / "config.toml", write_config(self.asked, _versions()))
+        write(folder / "config.toml", write_config(self.asked, versions()))
 
     def _checkpoint(self) -> dict[str, Any]:
         """Everything that the next update depends on, for `write_checkpoint`."""
@@ -303,6 +305,7 @@ class _Run(BaseCallback):
             "rewards": {name: getattr(self.env.ret_rms, name) for name in _RUNNING} | {"returns": self.env.returns},
             "before": self.learner.before,
             "shield": None if self.learner.shield is None else self.learner.shield.get_state(),
+            "script": self.learner.script and self.learner.script.get_state(),
             "curve": self.curve,
             "seconds": self.elapsed(),
         }
@@ -319,6 +322,8 @@ class _Run(BaseCallback):
             self.learner.before = restored(self.learner.before, saved["before"], "before")
             if (shield := self.learner.shield) is not None:
                 shield.set_state(restored(shield.get_state(), saved["shield"], "shield"))
+            if script := self.learner.script:
+                script.set_state(restored(script.get_state(), saved["script"], "script"))
             rewards, running = saved["rewards"], self.env.ret_rms
             if not all(np.shape(rewards[name]) == () and np.isfinite(rewards[name]) for name in _RUNNING):
                 raise ValueError("the running statistics of the rewards aren't finite")
@@ -343,8 +348,3 @@ class _Stoppable:
     def act(self, observations: Observations) -> dict[str, Float32Array]:
         self._run._stop_if_interrupted()
         return self._policy.act(observations)
-
-
-def _versions() -> dict[str, str]:
-    found = {name: importlib.metadata.version(name) for name in ("stable_baselines3", "torch", "numpy", "gymnasium")}
-    return {"khop_env": khop_env.__version__, "python": platform.python_version(), **found}

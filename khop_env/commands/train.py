@@ -71,6 +71,15 @@ def train(
             "--policies filter:ppo:FOLDER.",
         ),
     ] = None,
+    residual: Annotated[
+        str | None,
+        typer.Option(
+            "--residual",
+            metavar="SCRIPT",
+            help="Learn on top of a scripted policy, whose actions the networks' are added to: leader_following, "
+            "tanh:gain=2. Before training the policy acts as the script.",
+        ),
+    ] = None,
     initial: Annotated[
         str | None,
         typer.Option(
@@ -128,6 +137,7 @@ def train(
         "observe": observe and observe.value,
         "bounds": bounds,
         "shield": shield,
+        "residual": residual,
         "initial": initial,
         "algorithm": algo and algo.value,
         "per_type": per_type,
@@ -223,7 +233,8 @@ def _chosen(
 
 def _folder(config: TrainingConfig, environment: str) -> str:
     shield = "" if config.shield is None else f"shield-{config.shield}"
-    extras = "bounds" * config.bounds, shield, "per_type" * config.per_type
+    residual = "" if config.residual is None else f"residual-{config.residual}"
+    extras = "bounds" * config.bounds, shield, residual, "per_type" * config.per_type
     return folder_name(
         environment, str(config.scenario or ""), config.observe, *extras, f"{config.algorithm}-{config.seed}"
     )

@@ -21,7 +21,7 @@ from khop_env.observers.prediction import predict
 from khop_env.observers.solve import solve
 from khop_env.physics.right_hand_sides import input_maps
 from khop_env.simulation.edge_law import HELD, command_inputs
-from khop_env.simulation.packed_system import (
+from khop_env.simulation.packing import (
     System,
     Values,
     Work,

@@ -1,6 +1,6 @@
-"""The arguments of a compiled step: its arrays, and its equations, packed into two.
+"""The arrays of a compiled step, as few arguments, and how compiled code finds its way in them.
 
-Every argument of a compiled call takes time, some 50 ns an array, and the equations are more than 60.
+Every argument of a compiled call takes time, some 50 ns an array; the equations alone are more than 60.
 """
 
 from __future__ import annotations
