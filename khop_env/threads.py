@@ -13,6 +13,8 @@ import numpy as np
 Range: TypeAlias = tuple[int, int]
 """First index and one past the last."""
 T = TypeVar("T")
+WORTH_A_START = 40_000
+"""Numbers that a thread has to compute for its start and end, some 50 us, to pay; a sine counts as ten."""
 
 
 def processors() -> int:
@@ -43,6 +45,10 @@ class Threads:
         """As many equal parts of range(size) as there are threads; fewer where a part would be below `least`."""
         count = max(1, min(self.count, size // least))
         return list(itertools.pairwise(np.linspace(0, size, count + 1).astype(int).tolist()))
+
+    def worthwhile(self, size: int, numbers: int) -> list[Range]:
+        """`ranges`, of parts in which enough is computed to be worth a thread: `numbers` for each index."""
+        return self.ranges(size, -(-WORTH_A_START // max(1, numbers)))
 
     def run(self, function: Callable[[Range], T], ranges: Sequence[Range]) -> list[T]:
         """`function` of every range, at once, and the results in their order.

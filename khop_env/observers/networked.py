@@ -103,6 +103,7 @@ class Networked:
         require_memory(self.estimator, sources.components)
         self.pool = Threads(self.threads)
         self._ranges = self.pool.ranges(num_envs, LANES)
+        self._light = self.pool.worthwhile(num_envs, layout.pairs)
         self.channel = Channel(self.network, design.links, num_envs, shared + self.estimator.width)
         self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self.pool)
         self._activity = None if design.schedule is None else design.activity()
@@ -223,8 +224,8 @@ class Networked:
     # -- parts ---------------------------------------------------------------------------------------------------
 
     def _run(self, work: Callable[[Range], T]) -> list[T]:
-        """Results of `work` on all environments, a range for each thread."""
-        return self.pool.run(work, self._ranges)
+        """Results of `work`, of about a number for each pair, on all environments, in threads where that pays."""
+        return self.pool.run(work, self._light)
 
     def _plan_steps(self) -> None:
         """Decide which work may be divided."""

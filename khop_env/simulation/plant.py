@@ -64,6 +64,7 @@ class FleetPlant:
         self.disturbance, self.law, self.views = disturbance, law, views
         self.threads = threads or Threads(1)
         self.ranges = self.threads.ranges(num_envs)
+        self._of_stage, self._of_effect = (self.threads.worthwhile(num_envs, cost * fleet.n) for cost in (10, 2))
         self._limit = fleet.input_limit[:, None] if saturated else None
         self._rates = np.zeros((0, fleet.n, num_envs))
         attached = AttachedDisturbance((), fleet) if disturbance is None else disturbance
@@ -107,7 +108,7 @@ class FleetPlant:
         def part(range_: Range) -> bool:
             return advance_plant(*common, *range_)
 
-        if not all(self.threads.run(part, self.ranges)):
+        if not all(self.threads.run(part, self._of_stage)):
             require_finite(state.x, self.fleet)
 
     def rates_of(self, stages: int) -> FloatArray:
@@ -155,7 +156,7 @@ class FleetPlant:
             self.fleet.input_map(self._t, self._bind(state), self._inputs, self._effects)
             return
         common = self.runs, state.x, state.u, state.g
-        self.threads.run(lambda range_: input_maps(*common, *range_), self.ranges)
+        self.threads.run(lambda range_: input_maps(*common, *range_), self._of_effect)
 
     def checked_inputs(self, u: ArrayLike) -> FloatArray:
         """Inputs (m,) or (B, m) that are to be held, checked.

@@ -23,9 +23,6 @@ from khop_env.physics import Fleet
 from khop_env.simulation import InitialSet
 from khop_env.threads import Threads
 
-WORTH_A_THREAD = 60_000
-"""Numbers that a thread has to compute to be worth its start: they take 60 to 100 us, starting it about 30."""
-
 Signature = dict[str, tuple[str, ...]]
 """Properties in words, by a plural noun, which two environments must have in common to exchange states."""
 
@@ -72,10 +69,9 @@ class World:
                 environment must not depend on the range.
             numbers: about how many it computes for an environment; a sine counts as ten.
         """
-        if self.threads.count == 1 or self.num_envs * numbers < 2 * WORTH_A_THREAD:
+        if self.threads.count == 1 or len(ranges := self.threads.worthwhile(self.num_envs, numbers)) == 1:
             function(0, self.num_envs)
         else:
-            ranges = self.threads.ranges(self.num_envs, -(-WORTH_A_THREAD // max(1, numbers)))
             self.threads.run(lambda part: function(*part), ranges)
 
     @property

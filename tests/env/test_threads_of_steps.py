@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from khop_env import threads as module
 from khop_env.env import Hold, Lag, Settings, SlewLimit
 from khop_env.env.settings import FEWEST
 from khop_env.physics.velocity import VELOCITY_CONTROLLERS
@@ -41,7 +42,7 @@ def test_results_do_not_depend_on_threads(environment, copies, monkeypatch):
     """1, 2 and 3 of them, which share every part from two environments on."""
     name, arguments = CASES[environment]
     expected = play(environment, name, copies, **arguments)
-    monkeypatch.setattr(base, "WORTH_A_THREAD", 1)
+    monkeypatch.setattr(module, "WORTH_A_START", 1)
     parts, each = [], base.World.each
 
     def counted(world, function, numbers):
