@@ -134,7 +134,7 @@ def environment_rows(report: Report, quick: bool, say: Callable[[str], None], pe
 
     vmas = f"VMAS simple_spread, batch {batch}"
     plan: list[tuple[str, str, Rate, str, int, int, float | None]] = [
-        (f"single_order{order}", "MPE2 simple_spread", _single(order), "mpe2", 1, 1, 8.0 if order == 1 else None)
+        (f"single_order{order}", "MPE2 simple_spread", _single(order), "mpe2", 1, 1, 20.0 if order == 1 else None)
         for order in (1, 2)
     ]
     for scenario in ("paper", "convoy"):
