@@ -81,7 +81,7 @@ class EdgeArrays(NamedTuple):
         return cls.of(fleet, np.zeros((0, 2), np.int64), np.zeros(0, np.int64), nothing, nothing)
 
 
-def compiled_form(law: object) -> EdgeLaw | None:
+def compiled_law(law: object) -> EdgeLaw | None:
     """A law's compiled form, from its method `edge_law`; None for laws without one."""
     method = getattr(law, "edge_law", None)
     return None if method is None else method()

@@ -19,7 +19,7 @@ from khop_env.physics import Fleet, read_only
 from khop_env.physics.disturbance import AttachedDisturbance
 from khop_env.physics.right_hand_sides import drifts, input_maps
 from khop_env.physics.waveforms import disturb
-from khop_env.simulation.edge_law import HELD, EdgeArrays, EdgeLaw, compiled_form, has_compiled_controllers
+from khop_env.simulation.edge_law import HELD, EdgeArrays, EdgeLaw, compiled_law, has_compiled_controllers
 from khop_env.simulation.view import Law, ViewBuilder
 from khop_env.threads import Range, Threads
 
@@ -72,7 +72,7 @@ class FleetPlant:
         edges = None if views is None else views.edge_arrays()
         self.edges = EdgeArrays.none(fleet) if edges is None else edges
         own_law = law is not None and (
-            edges is None or not has_compiled_controllers(fleet) or compiled_form(law) is None
+            edges is None or not has_compiled_controllers(fleet) or compiled_law(law) is None
         )
         self._form: object = None
         self._law: tuple[Any, ...] = _HELD
