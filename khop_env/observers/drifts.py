@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from khop_env.observers.design import ObserverDesign
 from khop_env.observers.layout import FloatArray, PairLayout
 from khop_env.physics import AgentModel, read_only
 from khop_env.physics.right_hand_sides import Runs, drifts
@@ -47,6 +48,8 @@ class Drifts:
     Attributes:
         divisible: whether ranges of environments may be evaluated one by one, in several threads at once: the library's
             models work element by element; others may have been written for one caller and a whole batch.
+        runs: the compiled ones, the fields of `physics.right_hand_sides.Runs`.
+        in_python: the others.
     """
 
     def __init__(self, layout: PairLayout, drifts: Sequence[Drift | None], num_envs: int) -> None:
@@ -61,10 +64,20 @@ class Drifts:
                 columns, pairs = slice(last.columns.start, columns.stop), slice(last.pairs.start, pairs.stop)
             runs.append(_Run(drift, columns, pairs, block.components))
         self.divisible = all(run.drift.model.form is not None for run in runs)
-        in_kernel = [run for run in runs if run.drift.function is None and run.drift.model.form is not None]
-        self._in_python = [run for run in runs if run not in in_kernel]
-        parts = [(run.drift.model, run.pairs.stop - run.pairs.start, run.columns.start, 0) for run in in_kernel]
-        self._in_kernel: Any = tuple(Runs.of(parts)) if parts else None
+        parts, self.in_python = list[tuple[AgentModel, int, int, int]](), list[_Run]()
+        for run in runs:
+            if run.drift.function is None and run.drift.model.form is not None:
+                parts.append((run.drift.model, run.pairs.stop - run.pairs.start, run.columns.start, 0))
+            else:
+                self.in_python.append(run)
+        self.runs: tuple[Any, ...] = tuple(Runs.of(parts))
+
+    @classmethod
+    def known_in(cls, design: ObserverDesign, num_envs: int) -> Drifts:
+        """The models' drifts at the estimates of state observers that know them."""
+        layout, models = design.states.layout, design.fleet.models
+        known = [Drift(models[i]) if design.options[i].drift else None for i in layout.target.tolist()]
+        return cls(layout, known, num_envs)
 
     def evaluate(self, p: FloatArray, t: FloatArray, out: FloatArray, part: Range) -> None:
         """Write the drifts at estimates `p` (P, B) into `out` (P, B), in a range of environments.
@@ -76,9 +89,8 @@ class Drifts:
             part: the range.
         """
         low, high = part
-        if self._in_kernel is not None:
-            drifts(self._in_kernel, p, out, low, high)
-        for (model, function, _), columns, pairs, components in self._in_python:
+        drifts(self.runs, p, out, low, high)
+        for (model, function, _), columns, pairs, components in self.in_python:
             values = p[columns] if part == self._all else np.ascontiguousarray(p[columns, low:high])
             states = read_only(values.T.reshape(high - low, pairs.stop - pairs.start, components))
             times = read_only(t[:] if t.shape[1] == 1 else t[:, pairs])

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from khop_env.compiled import inlined, place
 from khop_env.observers.design import ObserverDesign
+from khop_env.observers.drifts import Drifts
 from khop_env.observers.layout import FloatArray, IntArray
-from khop_env.physics import AgentModel, read_only
-from khop_env.physics.right_hand_sides import Runs, drifts
-
-
-class _DriftRun(NamedTuple):
-    """Consecutive targets with equal models whose observers know f_i."""
-
-    model: AgentModel
-    columns: slice
-    pairs: int
+from khop_env.physics.right_hand_sides import drifts
 
 
 class Prediction:
@@ -31,13 +23,8 @@ class Prediction:
 
     def __init__(self, design: ObserverDesign, num_envs: int) -> None:
         self._num_envs = num_envs
-        self._drifts = _drift_runs(design)
-        self._inputs = _shared_columns(design)
-        predicted = sum(run.columns.stop - run.columns.start for run in self._drifts)
-        self._all_drifts_known = predicted == design.states.layout.size
-        known = all(run.model.form is not None for run in self._drifts)
-        parts = [(run.model, run.pairs, run.columns.start, 0) for run in self._drifts]
-        self._runs: tuple[Any, ...] | None = tuple(Runs.of(parts)) if known else None
+        self._drifts, self._inputs = Drifts.known_in(design, num_envs), _shared_columns(design)
+        self._all_drifts_known = all(design.options[i].drift for i in design.states.layout.target.tolist())
         inputs = [(states.start, ours.start, states.stop - states.start) for states, ours in self._inputs]
         self._input_runs: IntArray = np.array(inputs, np.int64).reshape(-1, 3).T.ravel()
 
@@ -47,23 +34,20 @@ class Prediction:
         Returns:
             The fields of `physics.right_hand_sides.Runs` of the estimates with a drift, None where a drift is Python;
             (3 K,) K runs of estimates with an input observer: first rows, the same among the input estimates,
-            numbers of rows; and
-            whether all estimates have a drift.
+            numbers of rows; and whether all estimates have a drift.
         """
-        return self._runs, self._input_runs, self._all_drifts_known
+        runs = None if self._drifts.in_python else self._drifts.runs
+        return runs, self._input_runs, self._all_drifts_known
 
     def rate(self, t: FloatArray, estimate: FloatArray, input_estimate: FloatArray, out: FloatArray) -> None:
         """Write f_i(x_hat) + g_hat into `out` (P, B), at times (B,), estimates (P, B) and input estimates (Q, B)."""
-        if self._runs is not None:
-            known, inputs = self._all_drifts_known, self._input_runs
-            predict(self._runs, known, inputs, estimate, input_estimate, out, 0, self._num_envs)
+        runs, inputs, known = self.compiled_runs()
+        if runs is not None:
+            predict(runs, known, inputs, estimate, input_estimate, out, 0, self._num_envs)
             return
-        if not self._all_drifts_known:
+        if not known:
             out.fill(0.0)
-        times = read_only(t[:, None])
-        for model, columns, pairs in self._drifts:
-            rates = model.drift(times, read_only(estimate[columns].T.reshape(self._num_envs, pairs, model.n)))
-            out[columns] = rates.reshape(self._num_envs, -1).T
+        self._drifts.evaluate(estimate, t[:, None], out, (0, self._num_envs))
         for state_columns, input_columns in self._inputs:
             out[state_columns] += input_estimate[input_columns]
 
@@ -91,21 +75,6 @@ def predict(
         for q in range(input_runs[2 * count + run]):
             for e in range(high - low):
                 out[to + q, place(low + e)] += input_estimate[source + q, place(low + e)]
-
-
-def _drift_runs(design: ObserverDesign) -> list[_DriftRun]:
-    """The targets whose observers know f_i, in as few runs as possible."""
-    models = design.fleet.models
-    runs: list[_DriftRun] = []
-    for block in design.states.layout.blocks:
-        if not design.options[block.agent].drift:
-            continue
-        model, columns, pairs = models[block.agent], block.columns, block.observers
-        if runs and runs[-1].columns.stop == columns.start and (runs[-1].model is model or runs[-1].model == model):
-            last = runs.pop()
-            model, columns, pairs = last.model, slice(last.columns.start, columns.stop), last.pairs + pairs
-        runs.append(_DriftRun(model, columns, pairs))
-    return runs
 
 
 def _shared_columns(design: ObserverDesign) -> list[tuple[slice, slice]]:

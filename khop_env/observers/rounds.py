@@ -20,7 +20,7 @@ from khop_env.compiled import compiled, place
 from khop_env.network import Network
 from khop_env.observers.base import Extremes, Memory, PlantState
 from khop_env.observers.design import ObserverDesign
-from khop_env.observers.drifts import Drift, Drifts
+from khop_env.observers.drifts import Drifts
 from khop_env.observers.estimators import Take
 from khop_env.observers.indexing import ranges
 from khop_env.observers.layout import FloatArray, IntArray, PairLayout
@@ -97,8 +97,7 @@ class Rounds:
         self._states = _held(states, estimate, 1, known)
         self._inputs = _held(inputs, input_estimate, own_input, heard)
         self._rho, self._omega = np.ones((states.rows, num_envs)), np.ones((inputs.rows, num_envs))
-        known_drifts = [Drift(fleet.models[i]) if design.options[i].drift else None for i in states.target.tolist()]
-        self._drifts = Drifts(states, known_drifts, num_envs)
+        self._drifts = Drifts.known_in(design, num_envs)
         self.divisible = self._drifts.divisible
         self._rate = np.zeros((states.size, num_envs))
         self._input = np.full(states.size, -1)  # row of the input estimate that belongs to each estimate
