@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from agents.learning.fingerprint import plain
 from agents.learning.residual import make_script
@@ -19,6 +19,7 @@ from khop_env.simulation import OBSERVE, Observe
 Algorithm = Literal["ppo", "sac"]
 ALGORITHMS = ("ppo", "sac")
 """Algorithms of `khop train`."""
+PolicyNetwork = Literal["mlp", "attention", "recurrent"]
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
@@ -61,6 +62,8 @@ class TrainingConfig:
         initial: folder of another run, of which policy, value function and exploration are taken on, or a policy's
             file; None for random networks.
         algorithm: learning algorithm, "ppo" or "sac".
+        policy: kind of network: "mlp", "attention" over the slots, whose order and number then don't matter, or
+            "recurrent", with memory.
         per_type: a network for each type of agent instead of one for all.
         timesteps: agent-steps in all, of all copies together.
         seed: seed of networks, episodes and exploration.
@@ -95,6 +98,7 @@ class TrainingConfig:
     residual: str | None = None
     initial: str | None = None
     algorithm: Algorithm = "ppo"
+    policy: PolicyNetwork = "mlp"
     per_type: bool = False
     timesteps: int = 2_000_000
     seed: int = 0
@@ -132,6 +136,10 @@ class TrainingConfig:
                 raise ValueError(f"arguments: {name!r} is a setting of its own, {name}={self.arguments[name]!r}")
         if self.algorithm not in ALGORITHMS:
             raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
+        if self.policy not in get_args(PolicyNetwork):
+            raise ValueError(f"policy must be one of {', '.join(get_args(PolicyNetwork))}; got {self.policy!r}")
+        if self.policy != "mlp":
+            raise ValueError(f"policy {self.policy!r} isn't there yet: choose 'mlp'")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
         if self.per_type and self.algorithm == "sac":

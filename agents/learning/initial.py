@@ -47,8 +47,8 @@ def begin_from(source: str, model: BaseAlgorithm, new: LearnedPolicy, env: EnvDe
 
 def _difference(old: LearnedPolicy, new: LearnedPolicy) -> str:
     """In what networks or features differ; empty if they don't."""
-    for name in ("algorithm", "per_type", "rates", "nearest", "hidden", "residual"):
-        pair = [policy.about.get(name) or False for policy in (old, new)]
+    for name in ("algorithm", "policy", "per_type", "rates", "nearest", "hidden", "residual"):
+        pair = [policy.about.get(name, "mlp" if name == "policy" else None) or False for policy in (old, new)]
         if pair[0] != pair[1]:
             return f"it was trained with {name} = {pair[0]!r}, and this run has {name} = {pair[1]!r}"
     kinds = [" and ".join(sorted(policy.networks)) for policy in (old, new)]

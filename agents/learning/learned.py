@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.learning.policy_file import Layers, PolicyFileError, read_policy, write_policy
+from agents.learning.forward import Memory, Network
+from agents.learning.policy_file import PolicyFileError, read_policy, write_policy
 from agents.learning.residual import make_script
 from agents.learning.scaling import RATE, ObservationScaler
 from agents.policy import EnvDescription, Observations, Policy, require_description, require_reset
@@ -22,20 +23,22 @@ PRETRAINED = Path(__file__).with_name("pretrained")
 
 @dataclass(eq=False)
 class LearnedPolicy:
-    """Networks from features of observations to actions; deterministic, with the previous observation as only memory.
+    """Networks from features of observations to actions; deterministic.
+
+    It remembers the previous observation, and what its networks remember.
 
     What was trained on top of a script (`about["residual"]`) adds its outputs to the script's actions, and clips the
     sum to [-1, 1]; the script may remember more and draw random numbers.
 
     If episodes of a batch end at different times, as with autoreset, the first rates of change after an end span both
-    episodes; `reset` drops the previous observation.
+    episodes; `reset` drops what it remembers.
 
     Attributes:
         environment: name of the environment it was trained for.
         columns: names of the columns of an observation.
         action_size: number of entries of an action.
         squash: whether outputs pass through tanh (SAC); otherwise they are clipped to [-1, 1] (PPO).
-        networks: layers by agent type, or under "" for all types.
+        networks: by agent type, or under "" for all types.
         scaler: computes the features of observations.
         about: settings and versions of the training run.
     """
@@ -44,11 +47,12 @@ class LearnedPolicy:
     columns: tuple[str, ...]
     action_size: int
     squash: bool
-    networks: Mapping[str, Layers]
+    networks: Mapping[str, Network]
     scaler: ObservationScaler
     about: Mapping[str, Any]
     _types: dict[str, str] = field(default_factory=dict, init=False, repr=False)
     _before: Float32Array | None = field(default=None, init=False, repr=False)
+    _memories: dict[str, Memory] = field(default_factory=dict, init=False, repr=False)  # of networks, or by agent
     _script: Policy | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -101,7 +105,8 @@ class LearnedPolicy:
                 f"filter:margin={margin}: before its name, or use --shield {margin}",
                 stacklevel=1,  # this line, so that it is said once
             )
-        self._types, self._before = {agent: model.type for agent, model in env.models.items()}, None
+        self._types = {agent: model.type for agent, model in env.models.items()}
+        self._before, self._memories = None, {}
         if self._script is not None:
             self._script.reset(env, seeds)
 
@@ -120,21 +125,18 @@ class LearnedPolicy:
             raise ValueError("LearnedPolicy knows no environment yet: call reset(describe(env), seeds) first")
         outputs: Iterable[Float32Array]
         if "" in self.networks:
-            outputs = self._forward(features, self.networks[""])
+            outputs = self._outputs("", "", features)
         else:
-            kinds = [self._types[agent] for agent in observations]
-            outputs = [self._forward(row, self.networks[kind]) for kind, row in zip(kinds, features, strict=True)]
+            rows = zip(observations, features, strict=True)
+            outputs = [self._outputs(self._types[agent], agent, row) for agent, row in rows]
         script = {} if self._script is None else self._script.act(observations)
         return {
             agent: np.clip(output + script[agent] if script else output, -1.0, 1.0)
             for agent, output in zip(observations, outputs, strict=True)
         }
 
-    def _forward(self, values: Float32Array, layers: Layers) -> Float32Array:
-        for number, (weight, bias) in enumerate(layers):
-            values = values @ weight.T + bias
-            if number < len(layers) - 1:
-                np.maximum(values, 0.0, out=values)
+    def _outputs(self, kind: str, whose: str, features: Float32Array) -> Float32Array:
+        values, self._memories[whose] = self.networks[kind](features, self._memories.get(whose))
         return np.tanh(values) if self.squash else values
 
     def save(self, path: Path) -> None:

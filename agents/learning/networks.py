@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from agents.learning.config import TrainingConfig
+from agents.learning.forward import Layers, Mlp, Network
 from agents.learning.learned import LearnedPolicy
-from agents.learning.policy_file import Layers
 from agents.learning.scaling import ObservationScaler
 
 
@@ -160,8 +160,8 @@ class LinearlyTo0:
         return self.rate * max(0.0, remaining)
 
 
-def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers]:
-    """The deterministic actor as arrays, by agent type ("" for all types).
+def actor_networks(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Network]:
+    """The deterministic actor without torch, by agent type ("" for all types).
 
     Args:
         model: PPO or SAC.
@@ -169,19 +169,20 @@ def actor_layers(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Layers
     """
     policy: Any = model.policy
     if isinstance(model, SAC) or not isinstance(policy.mlp_extractor, PerTypeExtractor):
-        return {"": _layers(_actor(model))}
+        return {"": Mlp(_layers(_actor(model)))}
     extractor, head = policy.mlp_extractor, policy.action_net
-    networks = {}
+    networks: dict[str, Network] = {}
     weight, bias = (parameter.detach().numpy().copy() for parameter in (head.weight, head.bias))
     width = weight.shape[1] // len(types)
     for number, kind in enumerate(types):
         block = weight[:, number * width : (number + 1) * width]
-        networks[kind] = (*_layers(extractor.actors[number]), (block[:, :-1].copy(), bias + block[:, -1]))
+        head_of_type = block[:, :-1].copy(), bias + block[:, -1]
+        networks[kind] = Mlp((*_layers(extractor.actors[number]), head_of_type))
     return networks
 
 
-def load_actor(model: BaseAlgorithm, networks: Mapping[str, Layers]) -> None:
-    """Give a model with one network for all agents the actor that `actor_layers` returned, of the same shapes.
+def load_actor(model: BaseAlgorithm, networks: Mapping[str, Network]) -> None:
+    """Give a model with one network for all agents the actor that `actor_networks` returned, of the same shapes.
 
     Raises:
         ValueError: for networks by type, of which a file has too little.
@@ -190,7 +191,7 @@ def load_actor(model: BaseAlgorithm, networks: Mapping[str, Layers]) -> None:
         raise ValueError("a policy's file with a network for each type isn't enough: name the folder of its run")
     linear = [layer for layer in _actor(model) if isinstance(layer, nn.Linear)]
     with torch.no_grad():
-        for layer, (weight, bias) in zip(linear, networks[""], strict=True):
+        for layer, (weight, bias) in zip(linear, networks[""].layers, strict=True):
             layer.weight.copy_(torch.as_tensor(weight))
             layer.bias.copy_(torch.as_tensor(bias))
 
@@ -225,7 +226,7 @@ def exported(
     """
     shape = model.action_space.shape
     assert shape is not None
-    squash, networks = config.algorithm == "sac", actor_layers(model, types)
+    squash, networks = config.algorithm == "sac", actor_networks(model, types)
     return LearnedPolicy(environment, tuple(columns), int(shape[0]), squash, networks, scaler, about)
 
 

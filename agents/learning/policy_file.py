@@ -13,17 +13,14 @@ import numpy as np
 
 from agents.learning.archive import ArchiveError, read_arrays, write_arrays
 from agents.learning.config import ALGORITHMS
+from agents.learning.forward import NETWORKS, Network, numbers, require
 from agents.learning.scaling import ObservationScaler
-from khop_env.env.layout import Float32Array
 
 FORMAT = 1
 MOST_BYTES = 2**28  # limit on a policy's arrays; the shipped policies have less than a thousandth of it
 _INDICES = ("valid", "moving", "headed", "heading", "planar", "slots", "places")
 _TABLES = ("planar", "slots", "places")  # of two dimensions
 _ABOUT = {"algorithm": str, "environment": str, "scenario": str, "bounds": bool}
-
-Layers = tuple[tuple[Float32Array, Float32Array], ...]
-"""(weight (out, in), bias (out,)) of each layer; ReLU between them."""
 
 
 class PolicyFileError(ValueError):
@@ -37,7 +34,7 @@ def write_policy(path: Path, fields: Mapping[str, Any]) -> None:
         path: the file.
         fields: fields of `LearnedPolicy`, by name.
     """
-    networks: Mapping[str, Layers] = fields["networks"]
+    networks: Mapping[str, Network] = fields["networks"]
     meta = {
         "format": FORMAT,
         "environment": fields["environment"],
@@ -45,14 +42,14 @@ def write_policy(path: Path, fields: Mapping[str, Any]) -> None:
         "action_size": fields["action_size"],
         "squash": fields["squash"],
         "types": list(networks),
-        "layers": {kind: len(layers) for kind, layers in networks.items()},
+        "network": next(iter(networks.values())).kind,
+        "layers": {kind: len(network.layers) for kind, network in networks.items()},
         "about": dict(fields["about"]),
     }
     scaler: ObservationScaler = fields["scaler"]
     arrays: dict[str, Any] = {name: getattr(scaler, name) for name in ("scale", "rate", *_INDICES)}
-    for kind, layers in networks.items():
-        for number, (weight, bias) in enumerate(layers):
-            arrays[f"{kind}/{number}/weight"], arrays[f"{kind}/{number}/bias"] = weight, bias
+    for kind, network in networks.items():
+        arrays |= {f"{kind}/{name}": array for name, array in network.arrays().items()}
     write_arrays(path, {"meta": np.array(json.dumps(meta)), **arrays}, compress=True)
 
 
@@ -85,23 +82,26 @@ def _is_sb3(path: Path) -> bool:
 
 def _fields(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     stored = arrays["meta"]
-    _require(stored.shape == () and stored.dtype.kind == "U", "meta isn't a string")
+    require(stored.shape == () and stored.dtype.kind == "U", "meta isn't a string")
     meta = json.loads(str(stored))
-    _require(isinstance(meta, dict), "meta isn't a JSON object")
+    require(isinstance(meta, dict), "meta isn't a JSON object")
     if meta["format"] != FORMAT:
         raise ArchiveError(f"its format is {meta['format']!r:.40}; expected {FORMAT}")
     for name, kind in {"environment": str, "columns": list, "action_size": int, "squash": bool}.items():
-        _require(type(meta[name]) is kind, f"{name} isn't of type {kind.__name__}")
+        require(type(meta[name]) is kind, f"{name} isn't of type {kind.__name__}")
     columns, about, counts = meta["columns"], meta["about"], meta["layers"]
-    _require(bool(columns) and all(isinstance(name, str) for name in columns), "columns isn't a list of names")
-    _require(meta["action_size"] > 0, "action_size isn't positive")
+    require(bool(columns) and all(isinstance(name, str) for name in columns), "columns isn't a list of names")
+    require(meta["action_size"] > 0, "action_size isn't positive")
     for name, kind in _ABOUT.items():
-        _require(isinstance(about, dict) and type(about.get(name)) is kind, f"about has no {name}")
-    _require(about["algorithm"] in ALGORITHMS, f"the algorithm is {about['algorithm']!r:.40}")
-    _require(isinstance(counts, dict) and bool(counts), "it has no networks")
-    _require(all(type(count) is int and 0 < count <= 100 for count in counts.values()), "numbers of layers are invalid")
+        require(isinstance(about, dict) and type(about.get(name)) is kind, f"about has no {name}")
+    require(about["algorithm"] in ALGORITHMS, f"the algorithm is {about['algorithm']!r:.40}")
+    require(isinstance(counts, dict) and bool(counts), "it has no networks")
+    require(all(type(count) is int and 0 < count <= 100 for count in counts.values()), "numbers of layers are invalid")
     scaler = _scaler(arrays, len(columns))
-    networks = {kind: _layers(arrays, kind, count, scaler.size, meta["action_size"]) for kind, count in counts.items()}
+    network = meta.get("network", "mlp")  # in files of earlier versions
+    require(isinstance(network, str) and network in NETWORKS, f"its network is {network!r:.40}")
+    read, outputs = NETWORKS[network].read, meta["action_size"]
+    networks = {kind: read(arrays, kind, count, scaler.size, outputs) for kind, count in counts.items()}
     return {
         "environment": meta["environment"],
         "columns": tuple(columns),
@@ -115,46 +115,21 @@ def _fields(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 def _scaler(arrays: Mapping[str, np.ndarray], columns: int) -> ObservationScaler:
     """The scaler, with its index arrays checked against the number of columns."""
-    scale, rate = _numbers(arrays, "scale", (columns,)), arrays["rate"]
-    _require(rate.shape == () and rate.dtype.kind in "fi" and 0.0 < float(rate) < math.inf, "rate isn't positive")
+    scale, rate = numbers(arrays, "scale", (columns,)), arrays["rate"]
+    require(rate.shape == () and rate.dtype.kind in "fi" and 0.0 < float(rate) < math.inf, "rate isn't positive")
     moving = len(arrays["moving"]) if arrays["moving"].ndim else 0
     limits = {"valid": columns + 1, "planar": columns + moving}
     found = {}
     for name in _INDICES:
         missing = np.zeros((0, 0), np.int64) if name in ("slots", "places") else None  # in files of earlier versions
         index, limit = arrays[name] if missing is None else arrays.get(name, missing), limits.get(name, columns)
-        _require(index.dtype == np.int64 and index.ndim == 1 + (name in _TABLES), f"{name} isn't an index")
-        _require(bool(np.all((index >= 0) & (index < limit))), f"{name} is out of range")
+        require(index.dtype == np.int64 and index.ndim == 1 + (name in _TABLES), f"{name} isn't an index")
+        require(bool(np.all((index >= 0) & (index < limit))), f"{name} is out of range")
         found[name] = index
     headed, planar = len(found["headed"]), found["planar"]
-    _require(len(found["valid"]) == columns, "valid has the wrong length")
-    _require(len(found["heading"]) == (2 if headed else 0), "heading isn't a pair of columns")
-    _require(planar.shape[1] == 2 and (headed > 0 or not len(planar)), "planar doesn't hold pairs")
-    _require(len(found["slots"]) == len(found["places"]), "slots and places have different lengths")
-    _require(found["places"].shape[1] > 0 or not len(found["places"]), "places has no columns")
+    require(len(found["valid"]) == columns, "valid has the wrong length")
+    require(len(found["heading"]) == (2 if headed else 0), "heading isn't a pair of columns")
+    require(planar.shape[1] == 2 and (headed > 0 or not len(planar)), "planar doesn't hold pairs")
+    require(len(found["slots"]) == len(found["places"]), "slots and places have different lengths")
+    require(found["places"].shape[1] > 0 or not len(found["places"]), "places has no columns")
     return ObservationScaler(scale=scale, rate=float(rate), **found)
-
-
-def _layers(arrays: Mapping[str, np.ndarray], kind: str, count: int, inputs: int, outputs: int) -> Layers:
-    """The layers of a network, with their shapes checked against each other."""
-    layers, width = [], inputs
-    for number in range(count):
-        name = f"{kind}/{number}"
-        size = outputs if number == count - 1 else len(np.atleast_1d(arrays[f"{name}/bias"]))
-        weight = _numbers(arrays, f"{name}/weight", (size, width))
-        layers.append((weight, _numbers(arrays, f"{name}/bias", (size,))))
-        width = size
-    return tuple(layers)
-
-
-def _numbers(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> Float32Array:
-    array = arrays[name]
-    _require(array.dtype == np.float32, f"{name} has dtype {array.dtype}; expected float32")
-    _require(array.shape == shape, f"{name} has shape {array.shape}; expected {shape}")
-    _require(bool(np.isfinite(array).all()), f"{name} isn't finite")
-    return array
-
-
-def _require(condition: bool, wrong: str) -> None:
-    if not condition:
-        raise ArchiveError(wrong)

@@ -58,6 +58,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "intervention": 0.0,
         "residual": None,
         "initial": None,
+        "policy": "mlp",
         **stored,
     }  # of earlier versions
     differs = [key for key in current if stored.get(key) != current[key]]

@@ -42,6 +42,14 @@ class AlgorithmOption(enum.StrEnum):
     SAC = "sac"
 
 
+class PolicyOption(enum.StrEnum):
+    """Kind of network."""
+
+    MLP = "mlp"
+    ATTENTION = "attention"
+    RECURRENT = "recurrent"
+
+
 def train(
     environment: Annotated[
         str | None,
@@ -90,6 +98,9 @@ def train(
         ),
     ] = None,
     algo: Annotated[AlgorithmOption | None, typer.Option(help="Algorithm; by default ppo.")] = None,
+    policy: Annotated[
+        PolicyOption | None, typer.Option(help="Kind of network; by default mlp. See the guide on training.")
+    ] = None,
     per_type: Annotated[bool | None, typer.Option("--per-type", help="One network for each type of agent.")] = None,
     timesteps: Annotated[
         int | None, typer.Option(min=1, help="Agent-steps of all copies together; by default 2000000.")
@@ -140,6 +151,7 @@ def train(
         "residual": residual,
         "initial": initial,
         "algorithm": algo and algo.value,
+        "policy": policy and policy.value,
         "per_type": per_type,
         "timesteps": timesteps,
         "seed": seed,
@@ -234,7 +246,8 @@ def _chosen(
 def _folder(config: TrainingConfig, environment: str) -> str:
     shield = "" if config.shield is None else f"shield-{config.shield}"
     residual = "" if config.residual is None else f"residual-{config.residual}"
-    extras = "bounds" * config.bounds, shield, residual, "per_type" * config.per_type
+    policy = "" if config.policy == "mlp" else config.policy
+    extras = "bounds" * config.bounds, shield, residual, policy, "per_type" * config.per_type
     return folder_name(
         environment, str(config.scenario or ""), config.observe, *extras, f"{config.algorithm}-{config.seed}"
     )

@@ -22,7 +22,7 @@ def run(tmp_path_factory):
 
 
 def weights(policy):
-    return [array for layers in policy.networks.values() for pair in layers for array in pair]
+    return [array for network in policy.networks.values() for pair in network.layers for array in pair]
 
 
 def same(first, second):

@@ -141,6 +141,7 @@ def test_huber_bounds_the_slope_of_the_reward():
         ({"learning_rate": 0.0}, "learning_rate must be positive"),
         ({"hidden": ()}, "hidden must be the positive widths"),
         ({"algorithm": "sac", "per_type": True}, "per_type is for 'ppo'"),
+        ({"policy": "transformer"}, "policy must be one of mlp, attention, recurrent; got .transformer."),
     ],
 )
 def test_settings_are_checked(changes, said):

@@ -224,3 +224,20 @@ def test_the_choice_between_several_shipped_policies_is_named(tmp_path, monkeypa
     env = make_batched("consensus_v0", "convoy")
     with pytest.raises(ValueError, match="the policy for leader_following_v0 doesn't fit consensus_v0"):
         play(env, make_policy("ppo:pretrained/leader_following_v0"), [0])
+
+
+def test_files_of_earlier_versions_have_one_kind_of_network(tmp_path):
+    """Their meta doesn't name it; a name that there isn't is refused."""
+    arrays = contents()
+    meta = json.loads(str(arrays["meta"]))
+    assert "network" not in meta
+    policy = LearnedPolicy.load(GOOD)
+    policy.save(tmp_path / "again.npz")
+    again = read_arrays(tmp_path / "again.npz", 2**24)
+    assert json.loads(str(again.pop("meta"))) == {**meta, "network": "mlp"}
+    assert all(np.array_equal(array, arrays[name]) for name, array in again.items() if name in arrays)
+    write_arrays(
+        tmp_path / "other.npz", {**arrays, "meta": np.array(json.dumps({**meta, "network": "x"}))}, compress=True
+    )
+    with pytest.raises(PolicyFileError, match=r"other.npz isn't a policy .*its network is 'x'"):
+        LearnedPolicy.load(tmp_path / "other.npz")

@@ -215,7 +215,7 @@ def test_resumed_it_goes_on_as_if_nothing_had_happened(environment, script, sett
 
     assert not train(chosen, tmp_path / "cut", on_progress=interrupt).finished
     assert train(chosen, tmp_path / "cut", resume=True).curve == whole.curve
-    one, other = (LearnedPolicy.load(tmp_path / name / "last.npz").networks[""] for name in ("whole", "cut"))
+    one, other = (LearnedPolicy.load(tmp_path / name / "last.npz").networks[""].layers for name in ("whole", "cut"))
     assert all(np.array_equal(a, b) for pair in zip(one, other, strict=True) for a, b in zip(*pair, strict=True))
     with pytest.raises(ValueError, match=r"residual = '.*' there and None here; resume with the same"):
         train(dataclasses.replace(chosen, residual=None), tmp_path / "cut", resume=True)
@@ -275,8 +275,8 @@ def test_networks_of_another_script_are_not_taken_on(tmp_path):
     train(chosen, tmp_path)
     begun = _Run(dataclasses.replace(chosen, initial=str(tmp_path), seed=3), None, None, None)
     last = LearnedPolicy.load(tmp_path / "last.npz")
-    assert np.array_equal(begun.policy.networks[""][-1][0], last.networks[""][-1][0])
-    assert np.abs(last.networks[""][-1][0]).max() > 0.0
+    assert np.array_equal(begun.policy.networks[""].layers[-1][0], last.networks[""].layers[-1][0])
+    assert np.abs(last.networks[""].layers[-1][0]).max() > 0.0
     for other in (None, "tanh"):
         with pytest.raises(ValueError, match=r"can't begin from .*: it was trained with residual = 'leader_following:"):
             _Run(dataclasses.replace(chosen, initial=str(tmp_path), residual=other), None, None, None)
