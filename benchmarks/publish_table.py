@@ -13,7 +13,7 @@ from datetime import date
 from pathlib import Path
 
 from agents.learning import PRETRAINED, TrainingConfig, pretrained_name
-from agents.learning.training import EVALUATION_SEEDS
+from agents.learning.curve import EVALUATION_SEEDS
 from agents.policy import describe
 from benchmarks.publish import commit
 from benchmarks.study import EPISODES, SEEDS, TASKS, folder_of, largest_ratio, measure, table, train_all

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -20,45 +16,24 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.evaluation import chosen_scenario, play
-from agents.learning.checkpoint import CheckpointError, model_state, restore_model, restored, write_checkpoint
+from agents.evaluation import chosen_scenario
+from agents.learning.checkpoint import CheckpointError, model_state, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
 from agents.learning.config_file import write_config
-from agents.learning.environment import TrainingVecEnv, build, described, training_environment
+from agents.learning.curve import Evaluation, Evaluator, as_csv
+from agents.learning.environment import TrainingVecEnv, described, training_environment
 from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.initial import begin_from
+from agents.learning.interrupts import Interrupts
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
 from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
-from agents.policies import safety_filter
-from agents.policy import EnvDescription, Observations, Policy
-from khop_env.env.layout import Float32Array
-
-EVALUATION_SEEDS = range(20_000, 20_032)
-"""Seeds of the episodes that select the best policy; they differ from the seeds of tuning and reporting."""
+from agents.learning.run_state import FAULTS, restore_run, run_state
 
 _FIRST_SEED = 1_000_000  # training episodes are drawn from generators with seeds from here on
-_RUNNING = ("mean", "var", "count")  # statistics of the discounted return, which normalise rewards
 
-OnProgress = Callable[[float, "Evaluation | None"], None]
+OnProgress = Callable[[float, Evaluation | None], None]
 """Called with the completed fraction, and with the evaluation if one was made."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """One point of the learning curve.
-
-    Attributes:
-        timesteps: agent-steps so far.
-        mean_return: over the evaluation episodes.
-        final_task_error: mean over the agents and episodes at the end, in the task's unit.
-        max_normalized_disagreement: largest |xi| / rho in the episodes.
-    """
-
-    timesteps: int
-    mean_return: float
-    final_task_error: float
-    max_normalized_disagreement: float
 
 
 @dataclass(frozen=True)
@@ -120,10 +95,6 @@ def train(
         return _Run(config, folder, saved, on_progress, asked).learn()
 
 
-class _StopError(Exception):
-    """Ctrl-C during an update or an evaluation."""
-
-
 class _Run(BaseCallback):
     """A training run, as a Stable-Baselines3 callback."""
 
@@ -149,12 +120,12 @@ class _Run(BaseCallback):
                 f"{folder} holds a run in another environment: {text}; resume it with the unchanged scenario, or "
                 "train in another folder"
             )
-        self.evaluation_env = build(config, len(EVALUATION_SEEDS))
+        self.evaluator, self.interrupts = Evaluator(config), Interrupts()
         self.description = described(batched, config)
         self.types = list(dict.fromkeys(model.type for model in batched.fleet.models))
         layout = self.description.layouts[batched.agents[0]]  # the first features are the observation's columns
         columns = [layout.index(f"own.type.{kind}") for kind in self.types]
-        self.interrupted, self.resumed = False, saved is not None
+        self.resumed = saved is not None
         log = None if folder is None else str(folder / "tensorboard")
         self.algorithm = make_model(config, self.env, columns, log)  # this seeds the environment as well
         self.env.seed((config.seed + 1) * _FIRST_SEED)
@@ -168,7 +139,7 @@ class _Run(BaseCallback):
         self.policy = self._exported()
         for name in model_state(self.algorithm)["parameters"]:
             if isinstance(optimizer := attrgetter(name)(self.algorithm), torch.optim.Optimizer):
-                optimizer.register_step_pre_hook(self._stop_if_interrupted)
+                optimizer.register_step_pre_hook(self.interrupts.check)
         if folder is not None:
             self._write_config(folder)
 
@@ -177,22 +148,22 @@ class _Run(BaseCallback):
         done = self.algorithm.num_timesteps
         self.start = time.perf_counter()
         if done < self.config.timesteps:
-            with self._interruptible():
+            with self.interrupts.caught():
                 self.algorithm.learn(
                     self.config.timesteps - done,
                     callback=self,
                     reset_num_timesteps=not self.resumed,
                     tb_log_name="run",
                 )
-                self._stop_if_interrupted()
+                self.interrupts.check()
                 self._evaluate()
                 self._save()
-        if self.interrupted and self.folder is not None:
+        if self.interrupts.interrupted and self.folder is not None:
             self._exported().save(self.folder / "last.npz")
             if not (self.folder / "best.npz").exists():
                 self._exported().save(self.folder / "best.npz")
         best = self.policy if self.folder is None else LearnedPolicy.load(self.folder / "best.npz")
-        return Training(best, self.curve, self.elapsed(), not self.interrupted)
+        return Training(best, self.curve, self.elapsed(), not self.interrupts.interrupted)
 
     def elapsed(self) -> float:
         """Seconds of training so far."""
@@ -206,32 +177,7 @@ class _Run(BaseCallback):
             self._save()
 
     def _on_step(self) -> bool:
-        return not self.interrupted
-
-    @contextmanager
-    def _interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C end the training after the current step of an episode, an update or an evaluation.
-
-        A second Ctrl-C raises KeyboardInterrupt as usual.
-        """
-        with contextlib.suppress(_StopError):
-            if threading.current_thread() is not threading.main_thread():
-                yield
-                return
-
-            def interrupt(*_: object) -> None:
-                self.interrupted = True
-                signal.signal(signal.SIGINT, before)
-
-            before = signal.signal(signal.SIGINT, interrupt)
-            try:
-                yield
-            finally:
-                signal.signal(signal.SIGINT, before)
-
-    def _stop_if_interrupted(self, *_: object) -> None:
-        if self.interrupted:
-            raise _StopError
+        return not self.interrupts.interrupted
 
     def _on_rollout_start(self) -> None:
         """Evaluate and save between updates, where policy and environment are consistent."""
@@ -246,16 +192,7 @@ class _Run(BaseCallback):
         if self.curve and self.curve[-1].timesteps == self.algorithm.num_timesteps:
             return
         policy = self._exported()
-        played: Policy = _Stoppable(policy, self)
-        if self.config.shield is not None:
-            played = safety_filter(str(self.config.shield), played, self.config.bounds)
-        episodes = play(self.evaluation_env, played, EVALUATION_SEEDS, name=self.config.algorithm)
-        found = Evaluation(
-            self.algorithm.num_timesteps,
-            float(episodes.returns.mean()),
-            float(episodes.final_task_error.mean()),
-            float(episodes.max_normalized_disagreement.max()),
-        )
+        found = self.evaluator(self.interrupts.stoppable(policy), self.algorithm.num_timesteps)
         self.curve.append(found)
         self.algorithm.logger.record("eval/mean_return", found.mean_return)
         self.algorithm.logger.record("eval/final_task_error", found.final_task_error)
@@ -282,12 +219,7 @@ class _Run(BaseCallback):
         if self.folder is None:
             return
         self._exported().save(self.folder / "last.npz")
-        lines = ["timesteps,mean_return,final_task_error,max_normalized_disagreement"]
-        lines += [
-            f"{point.timesteps},{point.mean_return!r},{point.final_task_error!r},{point.max_normalized_disagreement!r}"
-            for point in self.curve
-        ]
-        write(self.folder / "curve.csv", "\n".join(lines) + "\n")
+        write(self.folder / "curve.csv", as_csv(self.curve))
         write_checkpoint(self.folder / CHECKPOINT, self._checkpoint())
 
     def _write_config(self, folder: Path) -> None:
@@ -300,12 +232,7 @@ class _Run(BaseCallback):
         return {
             "config": self.config.as_dict(),
             "fingerprint": self.fingerprint,
-            "model": model_state(self.algorithm),
-            "environment": self.batched.get_state(),
-            "rewards": {name: getattr(self.env.ret_rms, name) for name in _RUNNING} | {"returns": self.env.returns},
-            "before": self.learner.before,
-            "shield": None if self.learner.shield is None else self.learner.shield.get_state(),
-            "script": self.learner.script and self.learner.script.get_state(),
+            **run_state(self.algorithm, self.env),
             "curve": self.curve,
             "seconds": self.elapsed(),
         }
@@ -317,34 +244,8 @@ class _Run(BaseCallback):
             CheckpointError: if `saved` isn't such a state.
         """
         try:
-            self.env.reset()
-            self.batched.set_state(restored(self.batched.get_state(), saved["environment"], "environment"))
-            self.learner.before = restored(self.learner.before, saved["before"], "before")
-            if (shield := self.learner.shield) is not None:
-                shield.set_state(restored(shield.get_state(), saved["shield"], "shield"))
-            if script := self.learner.script:
-                script.set_state(restored(script.get_state(), saved["script"], "script"))
-            rewards, running = saved["rewards"], self.env.ret_rms
-            if not all(np.shape(rewards[name]) == () and np.isfinite(rewards[name]) for name in _RUNNING):
-                raise ValueError("the running statistics of the rewards aren't finite")
-            running.mean, running.var, running.count = (rewards[name] for name in _RUNNING)
-            self.env.returns = restored(self.env.returns, rewards["returns"], "returns")
             self.curve = [restored(Evaluation(0, 0.0, 0.0, 0.0), point, "curve") for point in saved["curve"]]
             self.seconds = float(saved["seconds"])
-            restore_model(self.algorithm, saved["model"])
-        except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RuntimeError) as error:
+            restore_run(self.algorithm, self.env, saved)
+        except FAULTS as error:
             raise CheckpointError(f"{self.folder}: its {CHECKPOINT} can't be resumed ({error})") from error
-
-
-class _Stoppable:
-    """A policy that can be interrupted between its actions."""
-
-    def __init__(self, policy: Policy, run: _Run) -> None:
-        self._policy, self._run = policy, run
-
-    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        self._policy.reset(env, seeds)
-
-    def act(self, observations: Observations) -> dict[str, Float32Array]:
-        self._run._stop_if_interrupted()
-        return self._policy.act(observations)

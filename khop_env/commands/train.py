@@ -32,7 +32,7 @@ from khop_env.terminal import Progress, print_text, say, waiting
 
 if TYPE_CHECKING:
     from agents.learning import TrainingConfig
-    from agents.learning.training import Evaluation
+    from agents.learning.curve import Evaluation
 
 
 class AlgorithmOption(enum.StrEnum):

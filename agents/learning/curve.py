@@ -1,0 +1,63 @@
+"""The learning curve: evaluations of a policy during its training, which select the best one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
+
+from agents.evaluation import play
+from agents.learning.config import TrainingConfig
+from agents.learning.environment import build
+from agents.policies import safety_filter
+from agents.policy import Policy
+
+EVALUATION_SEEDS = range(20_000, 20_032)
+"""Seeds of the episodes that select the best policy; they differ from the seeds of tuning and reporting."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One point of the learning curve.
+
+    Attributes:
+        timesteps: agent-steps so far.
+        mean_return: over the evaluation episodes.
+        final_task_error: mean over the agents and episodes at the end, in the task's unit.
+        max_normalized_disagreement: largest |xi| / rho in the episodes.
+    """
+
+    timesteps: int
+    mean_return: float
+    final_task_error: float
+    max_normalized_disagreement: float
+
+
+class Evaluator:
+    """Plays the policy of a training on the evaluation's episodes, inside the training's safety filter if it has one.
+
+    Args:
+        config: settings of the training.
+    """
+
+    def __init__(self, config: TrainingConfig) -> None:
+        self._config, self._env = config, build(config, len(EVALUATION_SEEDS))
+
+    def __call__(self, policy: Policy, timesteps: int) -> Evaluation:
+        """The evaluation of a policy, trained for so many agent-steps."""
+        config = self._config
+        if config.shield is not None:
+            policy = safety_filter(str(config.shield), policy, config.bounds)
+        episodes = play(self._env, policy, EVALUATION_SEEDS, name=config.algorithm)
+        return Evaluation(
+            timesteps,
+            float(episodes.returns.mean()),
+            float(episodes.final_task_error.mean()),
+            float(episodes.max_normalized_disagreement.max()),
+        )
+
+
+def as_csv(curve: Sequence[Evaluation]) -> str:
+    """The text of curve.csv."""
+    lines = [",".join(field.name for field in fields(Evaluation))]
+    lines += [",".join(repr(value) for value in astuple(point)) for point in curve]
+    return "\n".join(lines) + "\n"
