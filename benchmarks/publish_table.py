@@ -1,80 +1,293 @@
-"""Train, measure, write docs/benchmarks/learning.md, its figure and the shipped policies: 1 to 2 hours on two cores.
+"""Train what is missing, measure, and write docs/benchmarks/learning.md and its figures.
 
-    .venv/bin/python -m benchmarks.publish_table
+    .venv/bin/python -m benchmarks.publish_table                # four hours on two cores
+    .venv/bin/python -m benchmarks.publish_table --hours 0      # with the trainings that there are
 
-Finished runs aren't repeated (runs/study); the pretrained policies are those trained on estimates with seed 0.
+Everything can be interrupted: the same command continues. Trainings are in runs/study, one folder each, measurements
+in runs/study/measured. What is trained in one call can be restricted; the page always has all that there is.
 """
 
+from __future__ import annotations
+
 import argparse
+import math
 import os
 import platform
-import shutil
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import date
 from pathlib import Path
+from typing import Any
 
-from agents.learning import PRETRAINED, TrainingConfig, pretrained_name
-from agents.learning.curve import EVALUATION_SEEDS
-from agents.policy import describe
+import numpy as np
+
+from agents.learning import TrainingConfig
+from agents.learning.run_folder import write
+from agents.workers import Interrupted
 from benchmarks.publish import commit
-from benchmarks.study import EPISODES, SEEDS, TASKS, folder_of, largest_ratio, measure, table, train_all
+from benchmarks.study import (
+    CONTINUOUS,
+    CORE_HOURS,
+    NAVIGATION,
+    NETWORKED,
+    RECIPES,
+    SEEDS,
+    TASKS,
+    Run,
+    StudyTask,
+    finished,
+    runs,
+    state_of,
+    train_all,
+)
+from benchmarks.study_measured import EPISODES, Block, measure
+from benchmarks.study_table import largest_ratios, summary, table
+from khop_env.observers import FloatArray
+from khop_env.physics import did_you_mean
 from khop_env.registry import make_batched
 from khop_env.results import learning_curves
 
 BY_HAND = "<!-- what follows is written by hand -->"
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--root", type=Path, default=Path("runs/study"), help="folder of the runs")
-parser.add_argument("--workers", type=int, default=2, help="processes")
-parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the table and the figure")
 
 
-def main() -> None:
-    """Run missing trainings, measure, and write the files."""
-    options = parser.parse_args()
-    train_all(options.root, workers=options.workers, say=lambda text: print(text, flush=True))
-    blocks = [measure(options.root, task, workers=options.workers) for task in TASKS]
-    hours = sum(block.seconds for block in blocks) / 3600.0
-    ratios = [largest_ratio(block) for block in blocks]
-    worst, late, bound = (max(column) for column in zip(*ratios, strict=True))
-    kept = "**The guarantee held in every episode**" if max(worst, bound) < 1.0 else "**THE GUARANTEE WAS BROKEN**"
-    budgets = ", ".join(f"{task.timesteps / 1e6:g} million on {task.label}" for task in TASKS)
-    text = [
-        "# Learned policies, measured\n",
-        f"Written by `python -m benchmarks.publish_table` on {date.today().isoformat()}, {commit()}: {len(SEEDS)} "
-        f"training seeds for each kind of observation, {len(EPISODES)} evaluation episodes, the same for every row and "
-        f"other than those that policies were trained, selected or tuned on. The trainings took {hours:.1f} hours of "
-        f"wall time added up, {options.workers} at a time on {os.cpu_count()} shared cores ({platform.machine()}, no "
-        f"GPU); agent-steps of each run: {budgets}. The evaluated policy of each run is the best of "
-        f"{TrainingConfig('consensus_v0').evaluations} evaluations on {len(EVALUATION_SEEDS)} further episodes.\n",
-        "Returns are means over agents of an episode's sum; ± is the 95 % interval over episodes, of learned policies "
-        "after averaging over training seeds. Scripts have the parameters that `khop tune` found for the "
-        "environment and the scenario, on estimates (also used on true states) or on neighbours only. A verdict "
-        "needs intervals over episodes and over training seeds that both exclude 0.\n",
-        f"{kept}, of learned, scripted, random and bang-bang policies alike: largest |e| {worst:.4f} over all time, "
-        f"{late:.4f} after the first quarter of an episode, largest error over its bound {bound:.4f}; the guarantee is "
-        "that all are below 1.\n",
+def main(arguments: Sequence[str] | None = None, tasks: Sequence[StudyTask] = TASKS) -> int:
+    """Train, measure and write.
+
+    Args:
+        arguments: of the command; None for the process's own.
+        tasks: blocks of the table.
+
+    Returns:
+        The exit status: 0, 1 if a training failed or couldn't be used, 130 after an interrupt.
+    """
+    start, options = time.time(), _options(arguments, tasks)
+    chosen = runs(options.only, options.seeds, options.trainings)
+    every = [run for run in runs(tasks) if run not in set(chosen)]
+    try:
+        until = start + 3600.0 * options.hours
+        problems = train_all(chosen, options.root, workers=options.workers, until=until, commit=commit(), say=_say)
+        problems += [f"{run.label}: {state.text}" for run in every if (state := state_of(run, options.root)).text]
+        blocks = measure(options.root, tasks, episodes=options.episodes, workers=options.workers, say=_say)
+    except (KeyboardInterrupt, Interrupted):
+        _say(
+            "interrupted: finished trainings and measurements are kept, others go on from their last evaluation with "
+            "the same command; the page wasn't changed"
+        )
+        return 130
+    page = options.docs / "benchmarks" / "learning.md"
+    images = options.docs / "images"
+    for folder in (page.parent, images):
+        folder.mkdir(parents=True, exist_ok=True)
+    figures = dict(_figures(options.root, tasks, images))
+    text = "\n".join(_page(options, tasks, blocks, figures, problems)).rstrip() + "\n"
+    written = page.read_text(encoding="utf-8") if page.exists() else ""
+    by_hand = "".join(written.partition(f"\n{BY_HAND}")[1:])  # stays
+    write(page, text + by_hand)
+    _say(f"wrote {page}")
+    for line, count in _counted(problems):
+        _say(f"not in it: {line}{f' ({count} trainings)' if count > 1 else ''}")
+    return 1 if problems else 0
+
+
+def _options(arguments: Sequence[str] | None, tasks: Sequence[StudyTask]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, default=Path("runs/study"), help="folder of the runs")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the page and the figures")
+    parser.add_argument("--hours", type=float, default=math.inf, help="begin no training after this time")
+    parser.add_argument("--only", default="", help="train only these tasks: environments or scenarios, with commas")
+    parser.add_argument("--trainings", default="", help=f"train only these kinds: {', '.join(RECIPES)}")
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train only the first seeds")
+    parser.add_argument("--episodes", type=int, default=len(EPISODES), help="episodes of each measurement")
+    options = parser.parse_args(arguments)
+    names = {
+        name: [task for task in tasks if name in (task.environment, task.scenario.partition(":")[0])]
+        for each in tasks
+        for name in (each.environment, each.scenario.partition(":")[0])
+    }
+    try:
+        only = [task for name in _names(options.only, names) for task in names[name]]
+        options.only = [task for task in tasks if task in only] if only else list(tasks)
+        options.trainings = _names(options.trainings, RECIPES) or list(RECIPES)
+        for name, least in (("workers", 1), ("seeds", 0), ("episodes", 2), ("hours", 0)):
+            if not getattr(options, name) >= least:
+                raise ValueError(f"--{name} must be at least {least}; got {getattr(options, name)}")
+    except ValueError as error:
+        parser.error(str(error))
+    options.seeds, options.episodes = SEEDS[: options.seeds], range(options.episodes)
+    return options
+
+
+def _names(text: str, known: Iterable[str]) -> list[str]:
+    """Names between commas.
+
+    Raises:
+        ValueError: for one that isn't known.
+    """
+    found = [name.strip() for name in text.split(",") if name.strip()]
+    for name in found:
+        if name not in known:
+            raise ValueError(f"there is no {name!r} in the study; {did_you_mean(name, list(known))}")
+    return found
+
+
+def _page(
+    options: argparse.Namespace,
+    tasks: Sequence[StudyTask],
+    blocks: Sequence[Block],
+    figures: Mapping[str, str],
+    problems: Sequence[str],
+) -> Iterator[str]:
+    """The page but for its end, which is written by hand."""
+    states = {run: state_of(run, options.root).kind for run in runs(tasks)}
+    done = [run for run, state in states.items() if state == "finished"]
+    marks = [mark for run in done if (mark := finished(run.folder(options.root))) is not None]
+    hours = sum(mark.seconds for mark in marks) / 3600.0
+    commits = ", ".join(
+        f"{name or 'unknown'} ({count})" for name, count in Counter(mark.commit for mark in marks).items()
+    )
+    steps = ", ".join(f"{task.timesteps / 1e6:g} million on {task.label}" for task in tasks)
+    missing = (
+        f"**{len(states) - len(done)} of {len(states)} trainings are missing**"
+        if len(done) < len(states)
+        else (f"All {len(states)} trainings have finished")
+    )
+    other = sum(state == "other" for state in states.values())
+    unused = f"; {other} have other settings than today's, and aren't counted" if other else ""
+    yield "# Learned policies, measured\n"
+    yield (
+        f"Written by `python -m benchmarks.publish_table` on {date.today().isoformat()}, {commit()}. "
+        f"{missing}{unused}: {len(SEEDS)} training seeds of each kind. The trainings took {hours:.1f} hours of the "
+        f"{CORE_HOURS:g} core hours that were planned (four hours of two cores), each on one of {os.cpu_count()} "
+        f"shared cores ({platform.machine()}, no GPU), by the code of {commits or 'no commit yet'}. Agent-steps of "
+        f"each: {steps}.\n"
+    )
+    worst, late, bound = largest_ratios(blocks)
+    held = worst < 1.0 and bound <= 1.0
+    kept = "**The guarantee held in every episode**" if held else "**THE GUARANTEE WAS BROKEN**"
+    yield (
+        f"{kept}, of learned, scripted, random and bang-bang policies alike: in continuous exchange the largest |e| "
+        f"was {worst:.4f}, {late:.4f} after the first quarter of an episode; the guarantee is that it is below 1. "
+        f"The largest error over its bound, or over its certificate where there is a network, was {bound:.4f}; it is "
+        "guaranteed not to be above 1.\n"
+    )
+    yield "## What was aimed at\n"
+    yield from summary(blocks)
+    yield "\n## How it was measured\n"
+    yield from _method(tasks, len(options.episodes))
+    for name, figure in figures.items():
+        yield f"![Learning curves{name}](../images/{figure})\n"
+    for block in blocks:
+        yield from table(block)
+    if problems:
+        yield "Not in the table:\n"
+        for line, count in _counted(problems):
+            yield f"- {line}{f' ({count} trainings)' if count > 1 else ''}"
+
+
+def _method(tasks: Sequence[StudyTask], episodes: int) -> Iterator[str]:
+    """Trainings, settings and statistics."""
+    yield "| training | settings beside those of `khop train` | trained over | tasks |"
+    yield "|---|---|---|---|"
+    for name, recipe in RECIPES.items():
+        settings = ", ".join(f"`{key}={value}`" for key, value in recipe.settings.items())
+        where = "all others" if name not in NAVIGATION else "navigation"
+        network = f"`{recipe.network}`" if recipe.network else "its scenario's network" if where == "navigation" else ""
+        yield f"| {name} | {settings} | {network or 'continuous exchange'} | {where} |"
+    yield ""
+    for task in tasks:
+        yield f"- `khop train {task.environment} --scenario {task.scenario}`: {_own_settings(task)}"
+    yield (
+        "\nThe policy of each run is the best of its evaluations on episodes of their own. Every row is played on the "
+        f"same {episodes} episodes, on which nothing was trained, selected or tuned. Returns are means over agents of "
+        "an episode's sum. ± beside a return is the 95 % interval over episodes, after averaging over training seeds; "
+        "`over seeds` is that over training seeds. IQM is the interquartile mean over seeds and episodes, with the "
+        "95 % interval of a bootstrap over both ([Agarwal et al., 2021](https://arxiv.org/abs/2108.13264)). Errors are "
+        "in m, means over agents; |e| and error over bound are the largest of all episodes and seeds, `late` those "
+        "after the first quarter of an episode.\n"
+    )
+    yield (
+        "Scripts have the parameters that `khop tune` found for environment and scenario in continuous exchange, on "
+        "estimates (used on true states and over networks, too) or on neighbours only. `khop tune --env network=...` "
+        "would tune over a network; that wasn't done. Differences are paired by episode and seed: better or worse is "
+        "said only where the intervals over episodes and over training seeds both exclude 0, level where they don't "
+        f"but stay within 3 %. The wider of both is in the summary. {_estimators(tasks)}\n"
+    )
+    yield (
         "In consensus an agent can meet the others without communication: it goes to the origin, where initial sets "
         "are centred. The script `leader_following` does so on neighbours only, and a network can learn it; in plain "
         "consensus estimates aren't decisive. They are where an agent follows a moving reference that isn't its "
-        "neighbour.\n",
-        "![Learning curves](../images/learning.png)\n",
+        "neighbour.\n"
+    )
+
+
+def _own_settings(task: StudyTask) -> str:
+    """Settings that `khop train` chooses for a task, in words."""
+    plain = TrainingConfig(task.environment, task.scenario).as_dict()
+    own = TrainingConfig.suited(task.environment, scenario=task.scenario).as_dict()
+    differs = [f"`{key}={value}`" for key, value in own.items() if plain[key] != value]
+    return ", ".join(differs) or "the defaults of `TrainingConfig`"
+
+
+def _estimators(tasks: Sequence[StudyTask]) -> str:
+    """A sentence on the estimators over networks."""
+    found: dict[str, list[str]] = {}
+    for task in tasks:
+        arguments: dict[str, Any] = {} if set(task.recipes) <= set(NAVIGATION) else {"network": "ideal"}
+        observers: Any = make_batched(task.environment, task.scenario, **arguments).simulator.observers
+        found.setdefault(observers.estimator.name, []).append(task.label)
+    if len(found) == 1:
+        return f"The estimator over networks is `{next(iter(found))}`."
+    return (
+        "Estimators over networks: "
+        + ", ".join(f"`{name}` ({', '.join(where)})" for name, where in found.items())
+        + "."
+    )
+
+
+def _figures(root: Path, tasks: Sequence[StudyTask], images: Path) -> Iterator[tuple[str, str]]:
+    """What each figure shows beside learning curves, and its file, which it writes."""
+    for title, file, names in (
+        ("", "learning.png", (*CONTINUOUS, *NAVIGATION)),
+        (" over networks", "learning_networks.png", tuple(NETWORKED)),
+    ):
+        curves: dict[str, Mapping[str, tuple[FloatArray, FloatArray]]] = {}
+        for task in tasks:
+            named = {name: found for name in names if (found := _curve(root, task, name)) is not None}
+            if named:
+                curves[task.label] = named
+        if curves:
+            learning_curves(curves, images / file)
+            yield title, file
+
+
+def _curve(root: Path, task: StudyTask, name: str) -> tuple[FloatArray, FloatArray] | None:
+    """Agent-steps (T,) and mean returns (seeds, T) of the finished trainings of a kind; None if there is none."""
+    if name not in task.recipes:
+        return None
+    made = [run for seed in SEEDS if state_of(run := Run(task, name, seed), root).kind == "finished"]
+    found = [
+        np.loadtxt(run.folder(root) / "curve.csv", delimiter=",", skiprows=1, usecols=(0, 1), ndmin=2) for run in made
     ]
-    for block in blocks:
-        text += table(block)
-    page, figure = options.docs / "benchmarks" / "learning.md", options.docs / "images" / "learning.png"
-    for path in (page, figure):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    written = page.read_text(encoding="utf-8") if page.exists() else ""
-    by_hand = "".join(written.partition(f"\n{BY_HAND}")[1:])  # stays
-    page.write_text("\n".join(text).rstrip() + "\n" + by_hand, encoding="utf-8")
-    curves = {block.task.label: (block.timesteps, block.curves) for block in blocks}
-    learning_curves(curves, figure)
-    PRETRAINED.mkdir(exist_ok=True)
-    for task in TASKS:
-        name = describe(make_batched(task.environment, task.scenario)).scenario
-        best = folder_of(options.root, task, "estimate", 0) / "best.npz"
-        shutil.copyfile(best, PRETRAINED / f"{pretrained_name(task.environment, name)}.npz")
-    print("\n".join(text))
+    if not found:
+        return None
+    shortest = min(map(len, found))
+    return found[0][:shortest, 0], np.array([curve[:shortest, 1] for curve in found])
+
+
+def _counted(problems: Sequence[str]) -> Iterator[tuple[str, int]]:
+    """The first line of those that say the same of several runs, and how many do."""
+    by_reason: dict[str, list[str]] = {}
+    for line in problems:
+        by_reason.setdefault(line.partition(": ")[2], []).append(line)
+    yield from ((lines[0], len(lines)) for lines in by_reason.values())
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

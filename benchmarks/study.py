@@ -1,31 +1,90 @@
-"""The published table: policies trained on estimates, the truth, and neighbours only, beside tuned scripts.
+"""The published study of learning: which policies are trained, on what they are played, and the trainings themselves.
 
-Every run has a folder of its own, and finished runs aren't repeated, so that an interrupted study can be continued.
+Every run has a folder of its own; finished runs aren't repeated, and one that was cut is continued.
 """
 
 from __future__ import annotations
 
+import json
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
-
-from agents.comparison import Comparison, Row, compare, interval95
 from agents.learning.config import TrainingConfig
+from agents.learning.config_file import read_config
+from agents.learning.run_folder import CHECKPOINT, write
 from agents.workers import run_in_processes
-from khop_env.observers import Exponential, FloatArray
-from khop_env.registry import scenario
-from khop_env.simulation import OBSERVE, Observe
+from khop_env.simulation import Observe
 
-SCRIPTS = ("tanh", "linear", "formation", "leader_following")
 SEEDS = range(5)
-EPISODES = range(100)
-DONE = "finished"
-WITHIN = 3.0  # percent: aim for the difference between policies trained on estimates and on true states
+DONE = "finished"  # file in the folder of a finished run
+CORE_HOURS = 8.0  # budget of all trainings: four hours of two cores
+SCRIPTS = ("tanh", "linear", "formation", "leader_following")
+LOSSY = "lossy:loss=0.3,burst=5"
+NETWORKS = ("ideal", "wifi", LOSSY)
+RANDOM = "random"  # networks that are drawn anew in every episode
+SHIELD = "certified,announce=true"
+FILTER = "filter:announce=true"  # the same filter around a policy that is played
+
+
+class Play(NamedTuple):
+    """On what a policy is played.
+
+    Attributes:
+        observe: observation mode.
+        network: None for the environment's own, which is continuous exchange but in navigation.
+        inside: name of a safety filter around it; "" for none.
+    """
+
+    observe: Observe = "estimate"
+    network: str | None = None
+    inside: str = ""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One kind of training.
+
+    Attributes:
+        plays: on what its policies are played; the first is what they were trained on.
+        settings: of `TrainingConfig`, where they aren't those that `khop train` uses by itself.
+        network: over which it is trained; None for the environment's own.
+    """
+
+    plays: Sequence[Play] = (Play(),)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    network: str | None = None
+
+
+def _over(*networks: str) -> tuple[Play, ...]:
+    return tuple(Play(network=network) for network in networks)
+
+
+CONTINUOUS: Mapping[str, Recipe] = {
+    "estimate": Recipe(),
+    "oracle": Recipe((Play("oracle"), Play("estimate")), {"observe": "oracle"}),
+    "local": Recipe((Play("local"),), {"observe": "local"}),
+    "estimate + bounds": Recipe(settings={"bounds": True}),
+    "residual": Recipe(settings={"residual": "leader_following"}),  # the best tuned script on all four tasks
+}
+NETWORKED: Mapping[str, Recipe] = {
+    "ideal": Recipe(_over(*NETWORKS), {}, "ideal"),
+    "wifi": Recipe(_over("wifi"), {}, "wifi"),
+    "lossy": Recipe(_over(LOSSY), {}, LOSSY),
+    "lossy + bounds": Recipe(_over(LOSSY), {"bounds": True}, LOSSY),
+    "lossy attention": Recipe(_over(LOSSY), {"policy": "attention"}, LOSSY),
+    "lossy attention + bounds": Recipe(_over(LOSSY), {"policy": "attention", "bounds": True}, LOSSY),
+    "random": Recipe(_over(*NETWORKS), {}, RANDOM),
+}
+NAVIGATION: Mapping[str, Recipe] = {
+    "shielded": Recipe((Play(inside=FILTER),), {"shield": SHIELD}),
+    "not shielded": Recipe((Play(), Play(inside=FILTER))),
+}
+RECIPES: Mapping[str, Recipe] = {**CONTINUOUS, **NETWORKED, **NAVIGATION}
+"""All kinds of trainings by name."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +95,13 @@ class StudyTask:
         environment: name of the environment.
         scenario: name of the scenario.
         timesteps: agent-steps of each training.
+        recipes: names of its trainings.
     """
 
     environment: str
     scenario: str
     timesteps: int
+    recipes: Sequence[str] = (*CONTINUOUS, *NETWORKED)
 
     @property
     def label(self) -> str:
@@ -50,276 +111,220 @@ class StudyTask:
 
 TASKS = (
     StudyTask("consensus_v0", "paper", 1_000_000),
+    StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000),
     StudyTask("leader_following_v0", "convoy", 1_500_000),
     StudyTask("leader_following_v0", "mixed_fleet", 1_500_000),
-    StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000),
-    StudyTask("formation_v0", "random_geometric:agents=12,rate=15", 1_000_000),
+    StudyTask("navigation_v0", "crossing", 1_000_000, tuple(NAVIGATION)),
 )
 
-VARIANTS: dict[str, dict[str, Any]] = {
-    "estimate": {"observe": "estimate"},
-    "oracle": {"observe": "oracle"},
-    "local": {"observe": "local"},
-    "estimate + bounds": {"observe": "estimate", "bounds": True},
-}
-"""Observations of the trainings, by name of the variant."""
+ORDER: Sequence[tuple[str | None, Sequence[str]]] = (
+    (None, ("estimate", "oracle")),
+    ("crossing", ("shielded",)),
+    ("convoy", ("lossy attention", "lossy attention + bounds")),
+    (None, ("residual", "ideal", "lossy", "random")),
+    (None, tuple(RECIPES)),
+)
+"""What is trained first: scenarios (None: all) and trainings, each with all seeds before the next."""
 
 
-@dataclass(frozen=True)
-class Learned:
-    """One variant's policies, played on one kind of observation.
-
-    Attributes:
-        variant: name of the observations in training.
-        observe: observation mode in the evaluation.
-        returns: (seeds, episodes) returns.
-        rows: results per training seed.
-    """
-
-    variant: str
-    observe: Observe
-    returns: FloatArray
-    rows: list[Row]
-
-    @property
-    def label(self) -> str:
-        """Name in the table, e.g. "PPO trained on oracle, on estimate"."""
-        if self.variant in (self.observe, f"{self.observe} + bounds"):
-            return f"PPO on {self.variant}"
-        return f"PPO trained on {self.variant}, on {self.observe}"
-
-
-@dataclass(frozen=True)
-class Block:
-    """Everything measured of one task.
+class Run(NamedTuple):
+    """One training.
 
     Attributes:
-        task: the task.
-        scripts: rows of the scripted policies under all observation modes, and of bang-bang adversaries.
-        learned: results of the learned policies.
-        curves: {variant: (seeds, evaluations)} learning curves, mean returns.
-        timesteps: (evaluations,) of the curves.
-        seconds: time of training in s, sum of all runs.
+        task: what is to be done.
+        recipe: name of the kind of training.
+        seed: training seed.
     """
 
     task: StudyTask
-    scripts: Comparison
-    learned: list[Learned]
-    curves: dict[str, FloatArray]
-    timesteps: FloatArray
+    recipe: str
+    seed: int
+
+    @property
+    def label(self) -> str:
+        """Name in messages."""
+        return f"{self.task.label}, {self.recipe}, seed {self.seed}"
+
+    def folder(self, root: Path) -> Path:
+        """Its folder in that of the study."""
+        scenario = self.task.scenario.replace(":", "-").replace(",", "-").replace("=", "")
+        recipe = self.recipe.replace(" + ", "-").replace(" ", "-")
+        return root / f"{self.task.environment}-{scenario}" / f"{recipe}-{self.seed}"
+
+    def config(self) -> TrainingConfig:
+        """Its settings: those that `khop train` uses by itself, with the recipe's.
+
+        Raises:
+            TypeError: if this version of the library lacks a setting.
+            ValueError: if a value is invalid.
+        """
+        recipe = RECIPES[self.recipe]
+        settings = {**recipe.settings, "scenario": self.task.scenario, "timesteps": self.task.timesteps}
+        if recipe.network is not None:
+            settings["arguments"] = {"network": recipe.network}
+        return TrainingConfig.suited(self.task.environment, seed=self.seed, **settings)
+
+
+def runs(
+    tasks: Sequence[StudyTask] = TASKS, seeds: Sequence[int] = SEEDS, recipes: Iterable[str] = RECIPES
+) -> list[Run]:
+    """All trainings, the most important first.
+
+    Args:
+        tasks: blocks of the table.
+        seeds: training seeds.
+        recipes: names of kinds of trainings.
+    """
+    chosen = set(recipes)
+    found = (
+        Run(task, name, seed)
+        for scenario, names in ORDER
+        for seed in seeds
+        for task in tasks
+        if scenario in (None, task.scenario)
+        for name in names
+        if name in task.recipes and name in chosen
+    )
+    return list(dict.fromkeys(found))
+
+
+class Finished(NamedTuple):
+    """What is written down when a training has finished.
+
+    Attributes:
+        seconds: wall time of the training.
+        commit: of the code that trained it, in words.
+    """
+
     seconds: float
+    commit: str
 
 
-def folder_of(root: Path, task: StudyTask, variant: str, seed: int) -> Path:
-    """Folder of a run."""
-    scenario = task.scenario.replace(":", "-").replace("=", "")
-    return root / f"{task.environment}-{scenario}" / f"{variant.replace(' + ', '-')}-{seed}"
-
-
-def seconds_of(folder: Path) -> float | None:
-    """Duration of the finished training of a folder in s; None if it hasn't finished, or its mark is damaged.
+def finished(folder: Path) -> Finished | None:
+    """What a finished training has written down; None if it hasn't finished, or its mark is damaged.
 
     Args:
         folder: folder of a run.
     """
     try:
-        return float((folder / DONE).read_text())
-    except (OSError, ValueError):
+        found = json.loads((folder / DONE).read_text(encoding="utf-8"))
+        return Finished(float(found["seconds"]), str(found["commit"]))
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
+class State(NamedTuple):
+    """Where a run stands.
+
+    Attributes:
+        kind: "finished"; "missing", also if it has only begun; "other" if its folder has other settings than today's;
+            "impossible" if this version of the library lacks its settings.
+        text: why it is one of the last two.
+    """
+
+    kind: Literal["finished", "missing", "other", "impossible"]
+    text: str = ""
+
+
+def state_of(run: Run, root: Path) -> State:
+    """Whether a run has finished with today's settings."""
+    folder = run.folder(root)
+    try:
+        wanted = run.config().as_dict()
+    except (TypeError, ValueError) as error:
+        return State("impossible", f"this version can't train it: {error}")
+    if not (folder / "config.toml").exists():
+        return State("missing")
+    try:
+        there = TrainingConfig(**read_config(folder / "config.toml")).as_dict()
+        differs = [f"{key} = {there[key]!r} and not {value!r}" for key, value in wanted.items() if there[key] != value]
+    except (TypeError, ValueError) as error:
+        differs = [str(error)]
+    if differs:
+        why = f"{folder} was trained with other settings than today's ({'; '.join(differs)})"
+        return State("other", f"{why}: it isn't used; move it away to train it again")
+    return State("missing" if finished(folder) is None else "finished")
+
+
+_INTERRUPTED = "interrupted"
+
+
+class _Job(NamedTuple):
+    run: Run
+    root: Path
+    until: float  # no training begins after this time
+    commit: str
+
+
 def train_all(
+    chosen: Sequence[Run],
     root: Path,
-    tasks: Sequence[StudyTask] = TASKS,
-    seeds: Sequence[int] = SEEDS,
     *,
     workers: int = 2,
+    until: float = float("inf"),
+    commit: str = "",
     say: Callable[[str], None] = print,
-) -> None:
-    """Run the missing trainings in several processes.
+) -> list[str]:
+    """Run the missing trainings.
 
     Args:
+        chosen: in this order.
         root: folder of the study.
-        tasks: blocks of the table.
-        seeds: training seeds.
-        workers: number of processes.
+        workers: number of processes; 1 for this one.
+        until: time (`time.time()`) after which no training begins.
+        commit: of the code, in words.
         say: called with a line after every run.
+
+    Returns:
+        A line for every run that failed, can't be trained, or wasn't because its folder has other settings.
+
+    Raises:
+        KeyboardInterrupt: on Ctrl-C; runs that were cut go on from their last evaluation the next time.
     """
-    jobs = [
-        (root, task, variant, seed)
-        for seed in seeds
-        for task in tasks
-        for variant in VARIANTS
-        if seconds_of(folder_of(root, task, variant, seed)) is None
-    ]
-    start = time.perf_counter()
-    for done, (_, text) in enumerate(run_in_processes(_train, jobs, workers), 1):
-        left = (time.perf_counter() - start) / done * (len(jobs) - done)
-        say(f"{done} of {len(jobs)}: {text}; about {left / 60:.0f} min left")
+    states = {run: state_of(run, root) for run in chosen}
+    problems = []
+    for run, state in states.items():
+        if state.text:
+            problems.append(f"{run.label}: {state.text}")
+            say(problems[-1])
+    jobs = [_Job(run, root, until, commit) for run, state in states.items() if state.kind == "missing"]
+    start, trained = time.perf_counter(), 0
+    for number, outcome in in_processes(_train, jobs, workers):
+        if outcome is None:
+            continue
+        good, text = outcome
+        if text == _INTERRUPTED:
+            raise KeyboardInterrupt
+        trained += 1
+        if not good:
+            problems.append(f"{jobs[number].run.label}: {text}")
+        left = (time.perf_counter() - start) / trained * (len(jobs) - trained)
+        say(f"{trained} of {len(jobs)}: {jobs[number].run.label}: {text}; about {left / 60:.0f} min left for all")
+    if len(jobs) > trained:
+        say(f"{len(jobs) - trained} of {len(jobs)} trainings weren't begun: the time is over")
+    return problems
 
 
-def measure(
-    root: Path, task: StudyTask, seeds: Sequence[int] = SEEDS, episodes: Sequence[int] = EPISODES, *, workers: int = 2
-) -> Block:
-    """Evaluate all policies of one task over the same episodes.
-
-    Args:
-        root: folder of the study.
-        task: the task.
-        seeds: training seeds.
-        episodes: seeds of the episodes.
-        workers: number of processes.
-    """
-
-    def played(policies: Sequence[str], observe: Sequence[Observe]) -> Comparison:
-        return compare(
-            task.environment,
-            policies,
-            observe,
-            scenario=task.scenario,
-            seeds=episodes,
-            workers=workers,
-        )
-
-    scripts = played([*SCRIPTS, "bang_bang", "zero", "random"], OBSERVE)
-    learned = []
-    plays: list[tuple[str, Observe]] = [(name, chosen["observe"]) for name, chosen in VARIANTS.items()]
-    for variant, observe in [*plays, ("oracle", "estimate")]:
-        specs = [f"ppo:{folder_of(root, task, variant, seed)}" for seed in seeds]
-        rows = played(specs, (observe,)).rows
-        learned.append(Learned(variant, observe, np.array([row.episodes.returns for row in rows]), rows))
-    curves, seconds = {}, 0.0
-    for variant in VARIANTS:
-        found = []
-        for seed in seeds:
-            folder = folder_of(root, task, variant, seed)
-            found.append(np.loadtxt(folder / "curve.csv", delimiter=",", skiprows=1))
-            seconds += seconds_of(folder) or 0.0
-        shortest = min(map(len, found))
-        curves[variant] = np.array([curve[:shortest, 1] for curve in found])
-        steps = found[0][:shortest, 0]
-    return Block(task, scripts, learned, curves, steps, seconds)
+def in_processes(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[tuple[int, Any]]:
+    """Index and result of each job as they are finished; with one worker in this process."""
+    return run_in_processes(function, jobs, workers) if workers > 1 else enumerate(map(function, jobs))
 
 
-def table(block: Block) -> Iterator[str]:
-    """The block in Markdown: means, intervals over episodes, spread over seeds, and the guarantee."""
-    yield f"## {block.task.label}\n"
-    yield f"Bounds on estimates fall at {rates_of(block.task.scenario)} 1/s.\n"
-    yield "| policy | return | spread over seeds | error at the end (m) | largest \\|e\\| | after the transient |"
-    yield "|---|---|---|---|---|---|"
-    best = {
-        mode: max(
-            (row for row in block.scripts.rows if row.observe == mode and row.policy in SCRIPTS),
-            key=lambda row: float(row.episodes.returns.mean()),
-        )
-        for mode in OBSERVE
-    }
-    for row in block.scripts.rows:
-        is_best, floor = row is best[row.observe], row.policy not in SCRIPTS and row.observe == "estimate"
-        if is_best or floor or row.policy in ("tanh", "linear"):
-            name = row.policy if floor else f"{row.policy}, tuned, on {row.observe}"
-            yield _line(name + " (best script)" * is_best, row.episodes.returns[None], [row])
-    for learned in block.learned:
-        yield _line(learned.label, learned.returns, learned.rows)
-    yield ""
-    for text in comparisons(block, best["estimate"], best["local"]):
-        yield f"- {text}"
-    yield ""
-
-
-def rates_of(name: str) -> str:
-    """The rates at which a scenario's bounds on state estimates fall, in 1/s."""
-    bounds = scenario(name).design.states.bounds
-    return " to ".join(
-        f"{rate:g}" for rate in sorted({bound.rate for bound in bounds if isinstance(bound, Exponential)})
-    )
-
-
-def comparisons(block: Block, script: Row, local_script: Row) -> Iterator[str]:
-    """Comparisons of observation modes and policies; differences are paired by episode and training seed."""
-    by = {(learned.variant, learned.observe): learned for learned in block.learned}
-    estimate, transferred = by["estimate", "estimate"], by["oracle", "estimate"]
-    against = _paired("learned on estimates, against learned on the truth", estimate, by["oracle", "oracle"])
-    percent = _percent(estimate, by["oracle", "oracle"])
-    low, high = (percent.mean() + sign * float(interval95(percent) or 0.0) for sign in (-1.0, 1.0))
-    aim = "reached" if low > -WITHIN else "missed" if high < -WITHIN else "open, the interval is wider than the aim"
-    yield f"{against} (aim: within {WITHIN:g} %: {aim})"
-    yield _paired("trained on the truth but played on estimates, against trained on estimates", transferred, estimate)
-    yield _paired("with the guaranteed bounds, against without", by["estimate + bounds", "estimate"], estimate)
-    tanh, linear = (
-        next(row for row in block.scripts.rows if (row.policy, row.observe) == (policy, "estimate"))
-        for policy in ("tanh", "linear")
-    )
-    for reference, returns in (
-        (f"the best tuned script on estimates ({script.policy})", script.episodes.returns[None]),
-        ("the tuned proportional law on estimates (linear)", linear.episodes.returns[None]),
-        ("the paper's law on estimates, tuned (tanh)", tanh.episodes.returns[None]),
-        (f"the best tuned script on neighbours only ({local_script.policy})", local_script.episodes.returns[None]),
-        ("learned on neighbours only", by["local", "local"].returns),
-    ):
-        yield f"learned on estimates, against {reference}: {_verdict(estimate.returns, returns)}"
-
-
-def largest_ratio(block: Block) -> tuple[float, float, float]:
-    """Largest |e| over all rows and episodes, after the transient, and largest error over its bound."""
-    rows = [*block.scripts.rows, *(row for learned in block.learned for row in learned.rows)]
-    results = [row.episodes for row in rows]
-    return (
-        max(float(episodes.max_normalized_disagreement.max()) for episodes in results),
-        max(float(episodes.late_normalized_disagreement.max()) for episodes in results),
-        max(float(episodes.max_error_to_bound.max()) for episodes in results),
-    )
-
-
-def _line(name: str, returns: FloatArray, rows: Sequence[Row]) -> str:
-    mean, interval = returns.mean(), interval95(returns.mean(axis=0))
-    spread = f"{returns.mean(axis=1).std(ddof=1):.3g}" if len(returns) > 1 else ""
-    results = [row.episodes for row in rows]
-    error = np.mean([episodes.final_task_error.mean() for episodes in results])
-    worst = max(float(episodes.max_normalized_disagreement.max()) for episodes in results)
-    late = max(float(episodes.late_normalized_disagreement.max()) for episodes in results)
-    return f"| {name} | {mean:.4g} ± {interval:.2g} | {spread} | {error:.3g} | {worst:.3f} | {late:.3f} |"
-
-
-def _percent(learned: Learned, reference: Learned) -> FloatArray:
-    """(seeds,) difference of returns in percent of the reference's absolute return, by training seed."""
-    return 100.0 * (learned.returns - reference.returns).mean(axis=1) / np.abs(reference.returns.mean(axis=1))
-
-
-def _paired(title: str, learned: Learned, reference: Learned) -> str:
-    """Difference relative to the reference by training seed, and paired by episode."""
-    percent, more = _percent(learned, reference), (learned.returns - reference.returns).mean(axis=0)
-    interval = interval95(percent)
-    over_seeds = "" if interval is None else f" ± {interval:.2g} % over training seeds"
-    return (
-        f"{title}: {percent.mean():+.2g} %{over_seeds}; paired by episode {more.mean():+.3g} ± {interval95(more):.2g}"
-    )
-
-
-def _verdict(ours: FloatArray, theirs: FloatArray) -> str:
-    """The difference of returns (seeds, episodes); better or worse only where intervals over both exclude 0."""
-    more = ours - theirs
-    mean = float(more.mean())
-    over_episodes = float(interval95(more.mean(axis=0)) or 0.0)
-    over_seeds = float(interval95(more.mean(axis=1)) or 0.0)
-    clear = abs(mean) > max(over_episodes, over_seeds)
-    verdict = ("better" if mean > 0.0 else "worse") if clear else "no clear difference"
-    relative = f"{100.0 * mean / abs(float(theirs.mean())):+.2g} %"
-    intervals = f"± {over_episodes:.2g} over episodes, ± {over_seeds:.2g} over training seeds"
-    return f"{mean:+.3g} {intervals} ({relative}): {verdict}"
-
-
-def _train(job: tuple[Path, StudyTask, str, int]) -> str:
-    from agents.learning.run_folder import CHECKPOINT
+def _train(job: _Job) -> tuple[bool, str] | None:
+    """Whether it went well, and in words what came out; None if it wasn't begun. One failure doesn't end the others."""
     from agents.learning.training import train
 
-    root, task, variant, seed = job
-    folder = folder_of(root, task, variant, seed)
-    config = TrainingConfig(task.environment, task.scenario, timesteps=task.timesteps, seed=seed, **VARIANTS[variant])
+    if time.time() > job.until:
+        return None
+    folder = job.run.folder(job.root)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        training = train(config, folder, resume=(folder / CHECKPOINT).exists())
-    if training.finished:
-        (folder / DONE).write_text(f"{training.seconds:.1f}")
+        try:
+            training = train(job.run.config(), folder, resume=(folder / CHECKPOINT).exists())
+        except Exception as error:
+            return False, f"failed: {type(error).__name__}: {error}"
+    if not training.finished:
+        return False, _INTERRUPTED
+    write(folder / DONE, json.dumps({"seconds": round(training.seconds, 1), "commit": job.commit}) + "\n")
     best = max(point.mean_return for point in training.curve)
-    return f"{task.label}, {variant}, seed {seed}: {best:.3f} in {training.seconds:.0f} s"
+    return True, f"{best:.4g} in {training.seconds:.0f} s"

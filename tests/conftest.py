@@ -40,6 +40,7 @@ SLOW = tuple(
         "agents/test_resuming.py",
         "agents/test_shielded.py::test_a_resumed_training",
         "agents/test_shielded.py::test_a_training_inside",
+        "benchmarks/test_study.py::test_the_command",
         "env/test_integrations.py::TestSuperSuit::test_ppo",
         "env/test_sb3.py::test_ppo",
         # processes, one or more per test

@@ -222,11 +222,14 @@ _NETWORK_LINES: dict[str, dict[str, Any]] = {
 }
 
 
-def learning_curves(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], path: str | Path) -> Path:
+def learning_curves(curves: Mapping[str, Mapping[str, tuple[FloatArray, FloatArray]]], path: str | Path) -> Path:
     """Learning curves, a panel per task: the median over training seeds, and the band between the extremes.
 
+    Of five seeds this band is a 94 % interval of the median (1 - 2 / 2^5, the interval of the sign test). Costs are on
+    a logarithmic axis; where a return is positive, returns are on a linear one.
+
     Args:
-        curves: by title, the agent-steps (T,) and by name the mean returns (seeds, T).
+        curves: by title and name, the agent-steps (T,) and the mean returns (seeds, T).
         path: path of the image file.
 
     Returns:
@@ -234,22 +237,31 @@ def learning_curves(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArr
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
+    names = list(dict.fromkeys(name for named in curves.values() for name in named))
+    styles = {
+        name: {"color": COLORS[number % len(COLORS)], "linestyle": (*_DASHES, "-.")[number % (len(_DASHES) + 1)]}
+        for number, name in enumerate(names)
+    }
+    rows = max(1, math.ceil(len(curves) / 2))
     with rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 3.1 * math.ceil(len(curves) / 2)), layout="constrained")
-        panels = figure.subplots(math.ceil(len(curves) / 2), 2, squeeze=False).ravel()
-        for axes, (title, (steps, named)) in zip(panels, curves.items(), strict=False):
-            for color, dashes, (name, returns) in zip(COLORS, (*_DASHES, "-."), named.items(), strict=False):
-                axes.plot(steps / 1e6, -np.median(returns, axis=0), color=color, linestyle=dashes, label=name)
-                axes.fill_between(
-                    steps / 1e6, -returns.max(axis=0), -returns.min(axis=0), color=color, alpha=0.12, linewidth=0.0
-                )
-            axes.set_yscale("log")
+        figure = Figure(figsize=(10.0, 3.1 * rows), layout="constrained")
+        panels = figure.subplots(rows, 2, squeeze=False).ravel()
+        for axes, (title, named) in zip(panels, curves.items(), strict=False):
+            costs = all((returns < 0.0).all() for _, returns in named.values())
+            sign = -1.0 if costs else 1.0
+            for name, (steps, returns) in named.items():
+                axes.plot(steps / 1e6, sign * np.median(returns, axis=0), label=name, **styles[name])
+                low, high = (sign * extreme(returns, axis=0) for extreme in (np.min, np.max))
+                axes.fill_between(steps / 1e6, low, high, color=styles[name]["color"], alpha=0.12, linewidth=0.0)
+            axes.set_yscale("log" if costs else "linear")
             axes.set_title(title, loc="left")
             axes.set_xlabel("million agent-steps")
-            axes.set_ylabel("cost (minus the return)")
+            axes.set_ylabel("cost (minus the return)" if costs else "return")
         for axes in panels[len(curves) :]:
             axes.set_axis_off()
-        panels[0].legend(fontsize=8.5, title="trained on")
+        entries = [Line2D([], [], label=name, **styles[name]) for name in names]
+        figure.legend(handles=entries, loc="outside right center", fontsize=8.5, handlelength=3.0, title="training")
         figure.savefig(path, dpi=130)
     return Path(path)

@@ -10,7 +10,7 @@ import pytest
 
 from agents import make_law
 from benchmarks import benchmark as module
-from benchmarks import environments, study
+from benchmarks import environments
 from benchmarks.benchmark import benchmark
 from benchmarks.comparison import compare, left_out
 from benchmarks.growth import held_memory
@@ -255,13 +255,6 @@ def test_ctrl_c_ends_the_command_with_a_table():
     assert json.loads(output)["interrupted"] is True
     assert "interrupted" in said
     assert "Traceback" not in said
-
-
-@pytest.mark.parametrize("text", [None, "", "12", "12.5\n", "half a lin"])
-def test_a_training_of_the_study_whose_mark_is_damaged_has_not_finished(tmp_path, text):
-    if text is not None:
-        (tmp_path / study.DONE).write_text(text)
-    assert study.seconds_of(tmp_path) == {"12": 12.0, "12.5\n": 12.5}.get(text)
 
 
 def test_memory_counts_arrays_and_objects_once_and_leaves_out_what_is_shared():

@@ -1,0 +1,282 @@
+"""The study in words: the tables of each task in Markdown, the comparisons below them, and what became of the aims."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from agents.outcomes import interval95, wilson95
+from benchmarks.study import CONTINUOUS, FILTER, LOSSY, NETWORKED, NETWORKS, SCRIPTS, SEEDS, Play
+from benchmarks.study_measured import FLOORS, Block, Row
+from benchmarks.study_statistics import LEVEL, Difference, difference, iqm, iqm95, short
+from khop_env.observers import Exponential
+from khop_env.registry import scenario
+from khop_env.simulation import OBSERVE
+
+WITHIN = f"on estimates within {LEVEL:g} % of the truth"
+AT_LEAST = "at least level with the best tuned script"
+ON_TOP = f"{AT_LEAST}, residual"
+PAY = "bounds and ages pay over a lossy network, MLP"
+PAY_ATTENTION = "bounds and ages pay over a lossy network, attention"
+NO_COLLISION = "shielded: no collision"
+ABOVE = "shielded: larger return than the scripts in the same filter"
+ARRIVE = "shielded: more successes than the scripts in the same filter"
+THREE = "clearly better than the best tuned script on three tasks"
+AIMS = (WITHIN, AT_LEAST, ON_TOP, PAY, PAY_ATTENTION, NO_COLLISION, ABOVE, ARRIVE)
+"""What is aimed at, in the order of the summary; `THREE` is counted from the others."""
+
+
+class Finding(NamedTuple):
+    """One comparison.
+
+    Attributes:
+        title: what is compared.
+        result: numbers.
+        aim: of `AIMS`; "" where nothing was aimed at.
+        verdict: what became of it, beginning with "reached", "missed" or "open".
+        brief: numbers for the summary.
+    """
+
+    title: str
+    result: str
+    aim: str = ""
+    verdict: str = ""
+    brief: str = ""
+
+
+def summary(blocks: Sequence[Block]) -> Iterator[str]:
+    """A table of aims and tasks: reached, missed by how much, or open."""
+    found = [(block.task.label, finding) for block in blocks for finding in findings(block)]
+    yield "| aim | task | difference | verdict |"
+    yield "|---|---|---|---|"
+    for aim in AIMS:
+        for label, finding in found:
+            if finding.aim == aim:
+                verdict = finding.verdict.replace("missed", "**missed**")
+                yield f"| {aim} | {label} | {finding.brief} | {verdict} |"
+    for kind, aim in (("PPO on estimates", AT_LEAST), ("residual", ON_TOP)):
+        chosen = [(label, finding) for label, finding in found if finding.aim in (aim, ABOVE)]
+        better = [label for label, finding in chosen if finding.verdict.startswith("reached: better")]
+        undecided = sum(finding.verdict.startswith("open") for _, finding in chosen)
+        if len(better) >= 3:
+            verdict = "reached"
+        else:
+            verdict = "open" if len(better) + undecided >= 3 else f"**missed** by {3 - len(better)}"
+        yield f"| {THREE}, {kind} | all | {len(better)} of {len(chosen)}: {', '.join(better) or 'none'} | {verdict} |"
+
+
+def table(block: Block) -> Iterator[str]:
+    """The tables and comparisons of one task."""
+    yield f"## {block.task.label}\n"
+    if block.navigates:
+        yield f"In the filter: as `{FILTER}:POLICY`. Alone: without it, where returns count no collisions.\n"
+        yield "| policy | seeds | return | over seeds | IQM | collided % | success % | arrival (s) |"
+        yield "|---|---|---|---|---|---|---|---|"
+        for row in block.rows:
+            yield _cells(_inside(row), row, _outcomes(row))
+    else:
+        yield f"In continuous exchange; bounds on estimates fall at {rates_of(block.task.scenario)} 1/s.\n"
+        yield "| policy | seeds | return | over seeds | IQM | error at the end | largest \\|e\\|, late | error/bound |"
+        yield "|---|---|---|---|---|---|---|---|"
+        for row in _shown(block, [Play(observe) for observe in OBSERVE], CONTINUOUS):
+            largest = f"{_most(row, 'max_normalized_disagreement')}, {_most(row, 'late_normalized_disagreement')}"
+            bounded = _most(row, "max_error_to_bound")
+            yield _cells(_label(row, _best_mark(block, row)), row, (_error(row), largest, bounded))
+        yield "\nOver networks; scripts have the parameters of continuous exchange.\n"
+        yield "| policy | on | seeds | return | over seeds | IQM | error at the end | error/certificate |"
+        yield "|---|---|---|---|---|---|---|---|"
+        for row in _shown(block, [Play(network=network) for network in NETWORKS], NETWORKED):
+            name = f"{row.name}{_best_mark(block, row)}" if not row.learned else f"PPO, {row.name}"
+            cells = (_error(row), _most(row, "max_error_to_bound"))
+            yield _cells(f"{name} | {(row.play.network or '').partition(':')[0]}", row, cells)
+    yield ""
+    for finding in findings(block):
+        aim = f" (aim: {finding.aim}: {finding.verdict})" if finding.aim else ""
+        yield f"- {finding.title}: {finding.result}{aim}"
+    yield ""
+
+
+def rates_of(name: str) -> str:
+    """The rates at which a scenario's bounds on state estimates fall, in 1/s."""
+    bounds = scenario(name).design.states.bounds
+    return " to ".join(
+        f"{rate:g}" for rate in sorted({bound.rate for bound in bounds if isinstance(bound, Exponential)})
+    )
+
+
+def largest_ratios(blocks: Sequence[Block]) -> tuple[float, float, float]:
+    """Largest |e| in continuous exchange, over all time and after the transient, and largest error over its bound."""
+    runs = [(row.play, run) for block in blocks for row in block.rows for run in row.runs]
+    keys = ("max_normalized_disagreement", "late_normalized_disagreement", "max_error_to_bound")
+    continuous = [
+        max((float(run[key].max()) for play, run in runs if play.network is None), default=0.0) for key in keys
+    ]
+    return continuous[0], continuous[1], max((float(run[keys[2]].max()) for _, run in runs), default=0.0)
+
+
+def findings(block: Block) -> Iterator[Finding]:
+    """All comparisons of one task, those with an aim first."""
+    if block.navigates:
+        yield from _navigation(block)
+        return
+    here, lossy = Play(), Play(network=LOSSY)
+    best, best_local = block.best(here), block.best(Play("local"))
+    leader = block.task.environment == "leader_following_v0"
+    on = {"": here, "ideal": Play(network="ideal"), "wifi": Play(network="wifi"), "lossy": lossy}
+
+    def against(
+        title: str, ours: str, where: Play, theirs: str | Row, aim: str = "", other: Play | None = None
+    ) -> Finding:
+        reference = block.row(theirs, other or where) if isinstance(theirs, str) else theirs
+        return _compared(title, block.row(ours, where), reference, aim)
+
+    script = f"the best tuned script on estimates ({best.name})"
+    yield against(
+        "learned on estimates, against learned on the truth", "estimate", here, "oracle", WITHIN, Play("oracle")
+    )
+    yield against(f"learned on estimates, against {script}", "estimate", here, best, AT_LEAST)
+    yield against(f"residual, against {script}", "residual", here, best, ON_TOP)
+    for kind, aim in (("lossy", PAY), ("lossy attention", PAY_ATTENTION)):
+        title = f"{kind}: with certificates in the observation, against without"
+        yield against(title, f"{kind} + bounds", lossy, kind, aim if leader else "")
+    yield against("residual, against learned from nothing", "residual", here, "estimate")
+    yield against(
+        "trained on the truth but played on estimates, against trained on estimates", "oracle", here, "estimate"
+    )
+    yield against("with the guaranteed bounds, against without", "estimate + bounds", here, "estimate")
+    title = f"learned on estimates, against the best tuned script on neighbours only ({best_local.name})"
+    yield against(title, "estimate", here, best_local)
+    yield against(
+        "learned on estimates, against learned on neighbours only", "estimate", here, "local", "", Play("local")
+    )
+    yield against("played lossy: trained ideal, against trained lossy", "ideal", lossy, "lossy")
+    yield against("played lossy: trained on random networks, against trained lossy", "random", lossy, "lossy")
+    yield against("played lossy: trained on random networks, against trained ideal", "random", lossy, "ideal")
+    yield against("played lossy: attention, against an MLP", "lossy attention", lossy, "lossy")
+    for name in ("ideal", "wifi", "lossy"):
+        reference = block.best(on[name])
+        yield against(f"{name}, against the best script there ({reference.name})", name, on[name], reference)
+
+
+def _navigation(block: Block) -> Iterator[Finding]:
+    inside, shielded = Play(inside=FILTER), block.row("shielded", Play(inside=FILTER))
+    if shielded is None:
+        yield Finding("shielded, collisions", "not trained yet", NO_COLLISION, "open: not trained yet")
+    else:
+        collided = shielded.values("collision")
+        text = f"{int(collided.sum())} of {collided.size} episodes"
+        verdict = (
+            f"missed: {text}" if collided.any() else "reached" if _complete(shielded) else "open: seeds are missing"
+        )
+        yield Finding("shielded, collisions", text, NO_COLLISION, verdict, text)
+    by_return, by_success = block.best(inside), block.best(inside, "success")
+    title = f"shielded, return against {_script(by_return)} in the same filter"
+    yield _compared(title, shielded, by_return, ABOVE)
+    title = f"shielded, share of successes against {_script(by_success)} in the same filter"
+    yield _compared(title, shielded, by_success, ARRIVE, "success")
+    other = block.row("not shielded", inside)
+    for key, what in (("returns", "return"), ("success", "share of successes")):
+        yield _compared(f"in the filter, {what}: trained in it, against trained alone", shielded, other, "", key)
+
+
+def _compared(title: str, ours: Row | None, theirs: Row | None, aim: str, key: str = "returns") -> Finding:
+    found = None if ours is None or theirs is None else difference(ours, theirs, key)
+    if ours is None or found is None:
+        return Finding(title, "not trained yet", aim, "open: not trained yet", "")
+    brief = f"{found.relative} ± {short(found.half)} %" if math.isfinite(found.half) else f"{found.relative} (one seed)"
+    return Finding(title, str(found), aim, _verdict(aim, found, _complete(ours)) if aim else "", brief)
+
+
+def _verdict(aim: str, found: Difference, complete: bool) -> str:
+    """What became of an aim: reached, missed by how much, or open."""
+    if found.over_seeds is None:
+        return "open: one seed only"
+    low, high = found.percent - found.half, found.percent + found.half
+    if aim == WITHIN:
+        if high < -LEVEL:
+            return f"missed by {short(-LEVEL - found.percent)} %"
+        return "reached" if low > -LEVEL else "open: the interval is wider than the aim"
+    if found.word == "worse":
+        return f"missed by {short(-found.percent)} %"
+    if found.word == "better":
+        return "reached: better"
+    if aim in (AT_LEAST, ON_TOP):
+        return "reached: level" if low > -LEVEL else "open: the interval is wider than the aim"
+    return "missed: no clear difference" if complete else "open: no clear difference yet"
+
+
+def _complete(row: Row) -> bool:
+    return len(row.seeds) >= len(SEEDS)
+
+
+def _shown(block: Block, plays: Sequence[Play], recipes: Container[str]) -> Iterator[Row]:
+    """On each of these: the best script, the proportional and the paper's law, floors; and then what was trained."""
+    for row in block.rows:
+        if row.play in plays and not row.learned and row.name in ("tanh", "linear", *FLOORS, block.best(row.play).name):
+            yield row
+    yield from (row for row in block.rows if row.learned and row.play in plays and row.name in recipes)
+
+
+def _best_mark(block: Block, row: Row) -> str:
+    return " (best script)" if not row.learned and row is block.best(row.play) else ""
+
+
+def _label(row: Row, mark: str = "") -> str:
+    """Name of a row in continuous exchange."""
+    on = f", on {row.play.observe}" if row.play.observe not in row.name.split() else ""
+    if row.learned:
+        return f"PPO, {row.name}{on}"
+    return f"{row.name}, tuned{on}{mark}" if row.name in SCRIPTS else row.name
+
+
+def _inside(row: Row) -> str:
+    """Name of a row in navigation."""
+    name = f"PPO, {row.name}" if row.learned else _script(row)
+    return f"{name}, {'in the filter' if row.play.inside else 'alone'}"
+
+
+def _script(row: Row) -> str:
+    """Name of a script, which may be in the filter."""
+    return row.name.removeprefix(FILTER).removeprefix(":") or "keep_right"
+
+
+def _cells(first: str, row: Row, rest: Sequence[str]) -> str:
+    """A line of a table; without runs it says so."""
+    seeds = f"{len(row.seeds)} of {len(SEEDS)}" if row.learned else ""
+    if not row.seeds:
+        return f"| {first} | {seeds} | " + " | ".join("" for _ in range(3 + len(rest))) + " |"
+    returns = row.returns
+    mean, over_episodes = returns.mean(), interval95(returns.mean(axis=0)) or 0.0
+    over_seeds = interval95(returns.mean(axis=1))
+    low, high = iqm95(returns)
+    cells = (
+        f"{mean:.4g} ± {over_episodes:.2g}",
+        "" if over_seeds is None else f"± {over_seeds:.2g}",
+        f"{iqm(returns):.4g} [{low:.4g}, {high:.4g}]",
+        *rest,
+    )
+    return f"| {first} | {seeds} | {' | '.join(cells)} |"
+
+
+def _error(row: Row) -> str:
+    return f"{row.values('final_task_error').mean():.3g}" if row.seeds else ""
+
+
+def _most(row: Row, key: str) -> str:
+    return f"{row.values(key).max():.3f}" if row.seeds else ""
+
+
+def _outcomes(row: Row) -> tuple[str, str, str]:
+    """Collisions and successes with Wilson's intervals, of all seeds' episodes together, and the time of arrival."""
+    if not row.seeds:
+        return "", "", ""
+    texts = []
+    for key in ("collision", "success"):
+        values = row.values(key).ravel()
+        low, high = wilson95(values)
+        texts.append(f"{100 * values.mean():.1f} [{100 * low:.1f}, {100 * high:.1f}]")
+    times = row.values("arrival_time")[row.values("success") > 0.5]
+    return texts[0], texts[1], f"{np.mean(times):.2f}" if times.size else ""
