@@ -30,6 +30,7 @@ from agents.learning.initial import begin_from
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
 from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
+from agents.learning.schedule import follow_schedule
 from agents.policies import safety_filter
 from agents.policy import EnvDescription, Observations, Policy
 from khop_env.env.layout import Float32Array
@@ -235,6 +236,7 @@ class _Run(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         """Evaluate and save between updates, where policy and environment are consistent."""
+        follow_schedule(self.algorithm, self.env, self.config)
         now, every = self.algorithm.num_timesteps, self.config.timesteps / self.config.evaluations
         if now // every > (self.curve[-1].timesteps // every if self.curve else 0):
             self._evaluate()
