@@ -29,6 +29,7 @@ from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
 from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
 from agents.learning.run_state import FAULTS, restore_run, run_state
+from agents.learning.schedule import follow_schedule
 
 _FIRST_SEED = 1_000_000  # training episodes are drawn from generators with seeds from here on
 
@@ -181,6 +182,7 @@ class _Run(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         """Evaluate and save between updates, where policy and environment are consistent."""
+        follow_schedule(self.algorithm, self.env, self.config)
         now, every = self.algorithm.num_timesteps, self.config.timesteps / self.config.evaluations
         if now // every > (self.curve[-1].timesteps // every if self.curve else 0):
             self._evaluate()
