@@ -84,6 +84,7 @@ class TrainingConfig:
             taken that rewards are divided by, so that small errors still count when large ones are over; 0 for all.
         huber: task error, in its unit, from which the training reward is linear in it; evaluation stays quadratic.
         evaluations: how often the policy is evaluated on fixed seeds, and saved.
+        evaluate_network: network of these evaluations, as `--network` takes it; None for that of the training.
         arguments: further arguments of the environment by name, e.g. {"control_period": 0.1, "reward": "team"}.
 
     Raises:
@@ -121,6 +122,7 @@ class TrainingConfig:
     reward_memory: int = 20_000
     huber: float = 1.0
     evaluations: int = 20
+    evaluate_network: str | None = None
     arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
@@ -148,6 +150,11 @@ class TrainingConfig:
             raise ValueError(f"policy {self.policy!r} isn't there yet: choose 'mlp'")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
+        if self.evaluate_network is not None:
+            try:
+                Network.of(self.evaluate_network)
+            except ValueError as error:
+                raise ValueError(f"evaluate_network: {error}") from None
         if self.per_type and self.algorithm == "sac":
             raise ValueError("per_type is for 'ppo'; 'sac' trains one network for all agents")
         for name in ("timesteps", "num_envs", "n_steps", "batch_size", "n_epochs", "evaluations"):

@@ -61,6 +61,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "policy": "mlp",
         "log_std_end": 100.0,
         "reward_memory": 0,
+        "evaluate_network": None,
         **stored,
     }  # of earlier versions
     differs = [key for key in current if stored.get(key) != current[key]]
