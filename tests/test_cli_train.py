@@ -6,9 +6,11 @@ import tomllib
 import pytest
 from test_cli import khop, only_json, refused
 
+from agents import play
 from agents.learning import LearnedPolicy, TrainingConfig
+from agents.learning.curve import EVALUATION_SEEDS
 from agents.learning.training import train
-from khop_env.registry import scenario
+from khop_env.registry import make_batched, scenario
 
 TINY = {"timesteps": 64, "num_envs": 2, "n_steps": 4, "batch_size": 8, "evaluations": 1, "hidden": [8]}
 FILE = "".join(f"{name} = {value}\n" for name, value in TINY.items())
@@ -169,3 +171,55 @@ def test_an_argument_that_is_a_setting_is_refused():
     with pytest.raises(ValueError, match="arguments: 'bounds' is a setting of its own, bounds=True"):
         TrainingConfig("consensus_v0", arguments={"bounds": True})
     assert hash(TrainingConfig("consensus_v0")) == hash(TrainingConfig("consensus_v0"))
+
+
+CALLBACK = """
+from stable_baselines3.common.callbacks import BaseCallback
+class Stop(BaseCallback):
+    def _on_step(self):
+        print("called at", self.num_timesteps)
+        return False
+"""
+
+
+def test_a_callback_ends_a_training(folder):
+    (folder / "my_stop.py").write_text(CALLBACK)
+    command = ("train", "consensus_v0", "--config", "tiny.toml", "--out", "out", "--timesteps", "128")
+    found = khop(*command, "--callback", "my_stop.py:Stop").stdout
+    assert "called at 16\nended by a callback at 64 of 128 agent-steps; --resume goes on" in found
+    assert only_json(khop(*command, "--resume", "--json"))["curve"][-1]["timesteps"] == 128
+    assert "my_stop.py has no 'Stp'; it has BaseCallback, Stop" in refused(*command, "--callback", "my_stop.py:Stp")
+
+
+def test_evaluations_over_another_network(folder):
+    command = ("train", "consensus_v0", "--config", "tiny.toml", "--network", "ideal")
+    lossy = "lossy:loss=0.5,burst=5"
+    found = only_json(khop(*command, "--evaluate-network", lossy, "--json"))
+    assert found["folder"] == "runs/train/consensus_v0-estimate-evaluated-lossy_loss_0.5_burst_5-ppo-0"
+    assert found["config"]["arguments"]["network"] == "ideal"
+    config = (folder / found["folder"] / "config.toml").read_text()
+    assert f'evaluate_network = "{lossy}"' in config
+    batched, policy = make_batched("consensus_v0", num_envs=32, network=lossy), LearnedPolicy.load(found["folder"])
+    assert found["best_return"] == play(batched, policy, EVALUATION_SEEDS).returns.mean()
+    plain = only_json(khop(*command, "--out", "out", "--json"))
+    assert plain["best_return"] != found["best_return"]
+    layers = [LearnedPolicy.load(each["folder"]).networks for each in (plain, found)]  # it learns the same
+    assert repr(layers[0]) == repr(layers[1])
+    shown = khop(*command, "--evaluate-network", lossy, "--out", "again").stdout
+    assert f"play it: khop evaluate consensus_v0 --network {lossy} --policies ppo:again" in shown.replace("\n", " ")
+    assert "evaluate_network = None there and 'wifi' here" in refused(
+        *command, "--evaluate-network", "wifi", "--out", "out", "--resume"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--evaluate-network", "wfi"), "evaluate_network: no network 'wfi'; did you mean 'wifi'?"),
+        (("--evaluate-network", "wifi"), "evaluate_network 'wifi': its observations also have "),
+        (("--network", "wifi", "--evaluate-network", "none"), "evaluate_network 'none': its observations lack "),
+    ],
+)
+def test_evaluations_that_cannot_be_played_are_refused(arguments, said, folder):
+    assert said in refused("train", "consensus_v0", "--config", "tiny.toml", *arguments)
+    assert not (folder / "runs").exists()

@@ -76,10 +76,15 @@ class TrainingConfig:
         batch_size: samples in a gradient step.
         n_epochs: passes over the samples of an update; PPO.
         clip_range: how far an update may change the probability of an action, as a fraction; PPO.
-        entropy: weight of the entropy bonus; PPO.
+        entropy: weight of the entropy bonus at the beginning; PPO.
         log_std: logarithm of the initial standard deviation of actions; PPO.
+        log_std_end: its upper limit at the end, to which the limit falls linearly from `log_std`, and the entropy bonus
+            to 0, so that exploration ends; a value above `log_std` for no limit and a constant bonus. PPO.
+        reward_memory: number of the latest samples, about, over which the running standard deviation of returns is
+            taken that rewards are divided by, so that small errors still count when large ones are over; 0 for all.
         huber: task error, in its unit, from which the training reward is linear in it; evaluation stays quadratic.
         evaluations: how often the policy is evaluated on fixed seeds, and saved.
+        evaluate_network: network of these evaluations, as `--network` takes it; None for that of the training.
         arguments: further arguments of the environment by name, e.g. {"control_period": 0.1, "reward": "team"}.
 
     Raises:
@@ -113,8 +118,11 @@ class TrainingConfig:
     clip_range: float = 0.2
     entropy: float = 0.02
     log_std: float = 0.5
+    log_std_end: float = -3.0
+    reward_memory: int = 20_000
     huber: float = 1.0
     evaluations: int = 20
+    evaluate_network: str | None = None
     arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
@@ -142,6 +150,11 @@ class TrainingConfig:
             raise ValueError(f"policy {self.policy!r} isn't there yet: choose 'mlp'")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
+        if self.evaluate_network is not None:
+            try:
+                Network.of(self.evaluate_network)
+            except ValueError as error:
+                raise ValueError(f"evaluate_network: {error}") from None
         if self.per_type and self.algorithm == "sac":
             raise ValueError("per_type is for 'ppo'; 'sac' trains one network for all agents")
         for name in ("timesteps", "num_envs", "n_steps", "batch_size", "n_epochs", "evaluations"):
@@ -158,10 +171,13 @@ class TrainingConfig:
         for name in ("intervention", "saturation"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be non-negative and finite; got {getattr(self, name)!r}")
-        if not 0.0 <= self.entropy < math.inf or not math.isfinite(self.log_std):
-            raise ValueError(
-                f"entropy must be non-negative and finite, log_std finite; got {self.entropy!r} and {self.log_std!r}"
-            )
+        if not 0.0 <= self.entropy < math.inf:
+            raise ValueError(f"entropy must be non-negative and finite; got {self.entropy!r}")
+        for name in ("log_std", "log_std_end"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite; got {getattr(self, name)!r}")
+        if isinstance(self.reward_memory, bool) or not isinstance(self.reward_memory, int) or self.reward_memory < 0:
+            raise ValueError(f"reward_memory must be a non-negative integer; got {self.reward_memory!r}")
         for name in ("gamma", "gae_lambda"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be from 0 to 1; got {getattr(self, name)!r}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 
@@ -10,9 +11,12 @@ from agents.learning.config import TrainingConfig
 from agents.learning.environment import build
 from agents.policies import safety_filter
 from agents.policy import Policy
+from khop_env.env import BatchedEnv
 
 EVALUATION_SEEDS = range(20_000, 20_032)
 """Seeds of the episodes that select the best policy; they differ from the seeds of tuning and reporting."""
+
+_LISTED = 3  # columns in an error message
 
 
 @dataclass(frozen=True)
@@ -37,10 +41,13 @@ class Evaluator:
 
     Args:
         config: settings of the training.
+
+    Raises:
+        ValueError: as `evaluation_environment`.
     """
 
     def __init__(self, config: TrainingConfig) -> None:
-        self._config, self._env = config, build(config, len(EVALUATION_SEEDS))
+        self._config, self._env = config, evaluation_environment(config, len(EVALUATION_SEEDS))
 
     def __call__(self, policy: Policy, timesteps: int) -> Evaluation:
         """The evaluation of a policy, trained for so many agent-steps."""
@@ -54,6 +61,30 @@ class Evaluator:
             float(episodes.final_task_error.mean()),
             float(episodes.max_normalized_disagreement.max()),
         )
+
+
+def evaluation_environment(config: TrainingConfig, num_envs: int) -> BatchedEnv:
+    """The environment in which the policy of a training is evaluated: the training's, over `evaluate_network` if set.
+
+    Raises:
+        ValueError: if its observations have other columns than those of the training.
+    """
+    network = config.evaluate_network
+    if network is None:
+        return build(config, num_envs)
+    try:
+        env = build(dataclasses.replace(config, arguments={**config.arguments, "network": network}), num_envs)
+    except ValueError as error:
+        raise ValueError(f"evaluate_network {network!r}: {error}") from error
+    ours, theirs = (dict.fromkeys(each.layouts[0].names) for each in (build(config, 1), env))
+    for verb, more, fewer in (("lack", ours, theirs), ("also have", theirs, ours)):
+        if differ := [name for name in more if name not in fewer]:
+            listed = ", ".join(differ[:_LISTED]) + ", ..." * (len(differ) > _LISTED)
+            raise ValueError(
+                f"evaluate_network {network!r}: its observations {verb} {listed}, other than those that the policy is "
+                f"trained on; train and evaluate both over networks, or both without one"
+            )
+    return env
 
 
 def as_csv(curve: Sequence[Evaluation]) -> str:

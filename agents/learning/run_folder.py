@@ -59,6 +59,9 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "residual": None,
         "initial": None,
         "policy": "mlp",
+        "log_std_end": 100.0,
+        "reward_memory": 0,
+        "evaluate_network": None,
         **stored,
     }  # of earlier versions
     differs = [key for key in current if stored.get(key) != current[key]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.evaluation import chosen_scenario
+from agents.learning.callbacks import EndedError, OwnCallbacks
 from agents.learning.checkpoint import CheckpointError, model_state, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
 from agents.learning.config_file import write_config
@@ -29,6 +30,7 @@ from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
 from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
 from agents.learning.run_state import FAULTS, restore_run, run_state
+from agents.learning.schedule import follow_schedule
 
 _FIRST_SEED = 1_000_000  # training episodes are drawn from generators with seeds from here on
 
@@ -44,7 +46,7 @@ class Training:
         policy: the policy with the best evaluation.
         curve: the evaluations.
         seconds: wall time of training, the time before a resumed checkpoint included.
-        finished: False if it was interrupted.
+        finished: False if it was interrupted; True where a callback ended it.
     """
 
     policy: LearnedPolicy
@@ -58,6 +60,7 @@ def train(
     out: str | Path | None = None,
     *,
     resume: bool = False,
+    callbacks: BaseCallback | Sequence[BaseCallback] = (),
     on_progress: OnProgress | None = None,
 ) -> Training:
     """Train a policy.
@@ -72,9 +75,13 @@ def train(
         config: settings; with `resume` they must equal those of the folder, except that `timesteps` may be larger.
         out: folder of the run; None to keep everything in memory.
         resume: whether to continue from the folder's checkpoint.
+        callbacks: Stable-Baselines3 callbacks, called beside the training's own. If one returns False, the training
+            ends after the current update, evaluated and saved. If one raises, the policy is saved as last.npz, and
+            the checkpoint of the last evaluation stays. Checkpoints don't hold them.
         on_progress: called with the completed fraction, and the evaluation if one was made.
 
     Raises:
+        TypeError: if a callback isn't one of Stable-Baselines3's.
         FileNotFoundError: if `resume` is set and there is no checkpoint.
         FileExistsError: if the folder holds a run and `resume` isn't set, or another training is running there.
         CheckpointError: if the checkpoint can't be read.
@@ -82,17 +89,18 @@ def train(
     """
     torch.set_num_threads(1)  # small networks don't gain from more
     folder = None if out is None else Path(out)
+    own = OwnCallbacks(callbacks)
     asked, config = config, dataclasses.replace(config, scenario=chosen_scenario(config.environment, config.scenario))
     if folder is None or not (folder / CHECKPOINT).exists():
         if resume:
             raise FileNotFoundError(f"nothing to resume: there is no {CHECKPOINT} in {folder}")
         if folder is None:
-            return _Run(config, None, None, on_progress, asked).learn()
+            return _Run(config, None, None, on_progress, asked, own).learn()
     with alone_in(folder):
         saved = load_checkpoint(folder, config) if resume else None
         if not resume and any((folder / name).exists() for name in (CHECKPOINT, "best.npz")):
             raise FileExistsError(f"{folder} holds a training run; continue it with --resume, or choose another folder")
-        return _Run(config, folder, saved, on_progress, asked).learn()
+        return _Run(config, folder, saved, on_progress, asked, own).learn()
 
 
 class _Run(BaseCallback):
@@ -105,8 +113,10 @@ class _Run(BaseCallback):
         saved: Mapping[str, Any] | None,
         on_progress: OnProgress | None,
         asked: TrainingConfig | None = None,
+        own: OwnCallbacks | None = None,
     ) -> None:
         super().__init__()
+        self.own = own or OwnCallbacks([])
         self.asked = asked or config  # with the scenario as the user names it
         self.config, self.folder, self.on_progress = config, folder, on_progress
         self.env: VecNormalize = training_environment(config)
@@ -148,22 +158,36 @@ class _Run(BaseCallback):
         done = self.algorithm.num_timesteps
         self.start = time.perf_counter()
         if done < self.config.timesteps:
-            with self.interrupts.caught():
-                self.algorithm.learn(
-                    self.config.timesteps - done,
-                    callback=self,
-                    reset_num_timesteps=not self.resumed,
-                    tb_log_name="run",
-                )
-                self.interrupts.check()
-                self._evaluate()
-                self._save()
-        if self.interrupts.interrupted and self.folder is not None:
-            self._exported().save(self.folder / "last.npz")
-            if not (self.folder / "best.npz").exists():
-                self._exported().save(self.folder / "best.npz")
+            try:
+                with self.interrupts.caught():
+                    self._learn(self.config.timesteps - done)
+                    self.interrupts.check()
+                    self._evaluate()
+                    self._save()
+                    self.algorithm.logger.dump(self.algorithm.num_timesteps)  # what the last update recorded
+            except BaseException:
+                self._keep()
+                raise
+        if self.interrupts.interrupted:
+            self._keep()
         best = self.policy if self.folder is None else LearnedPolicy.load(self.folder / "best.npz")
         return Training(best, self.curve, self.elapsed(), not self.interrupts.interrupted)
+
+    def _learn(self, timesteps: int) -> None:
+        """Train for so many more agent-steps, or until a callback of the user's ends it."""
+        callbacks = CallbackList([self, self.own])
+        try:
+            self.algorithm.learn(timesteps, callback=callbacks, reset_num_timesteps=not self.resumed, tb_log_name="run")
+        except EndedError:
+            callbacks.on_training_end()
+
+    def _keep(self) -> None:
+        """Save the policy of a training that doesn't come to its end."""
+        if self.folder is None:
+            return
+        self._exported().save(self.folder / "last.npz")
+        if not (self.folder / "best.npz").exists():
+            self._exported().save(self.folder / "best.npz")
 
     def elapsed(self) -> float:
         """Seconds of training so far."""
@@ -181,6 +205,7 @@ class _Run(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         """Evaluate and save between updates, where policy and environment are consistent."""
+        follow_schedule(self.algorithm, self.env, self.config)
         now, every = self.algorithm.num_timesteps, self.config.timesteps / self.config.evaluations
         if now // every > (self.curve[-1].timesteps // every if self.curve else 0):
             self._evaluate()
@@ -235,6 +260,7 @@ class _Run(BaseCallback):
             **run_state(self.algorithm, self.env),
             "curve": self.curve,
             "seconds": self.elapsed(),
+            "ended": self.own.ended,
         }
 
     def _restore(self, saved: Mapping[str, Any]) -> None:

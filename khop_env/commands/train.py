@@ -68,6 +68,15 @@ def train(
         bool | None, typer.Option("--bounds", help="Add the guaranteed bounds of the estimates to its observations.")
     ] = None,
     network: NetworkOption = None,
+    evaluate_network: Annotated[
+        str | None,
+        typer.Option(
+            "--evaluate-network",
+            metavar="NETWORK",
+            help="Evaluate over another network than it is trained on, as --network names them; the best policy is "
+            "then the best one there.",
+        ),
+    ] = None,
     estimator: EstimatorOption = None,
     shield: Annotated[
         str | None,
@@ -130,6 +139,14 @@ def train(
         Path | None,
         typer.Option(help="Folder; by default in runs/train/, named after environment, algorithm and seed."),
     ] = None,
+    callback: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--callback",
+            metavar="NAME",
+            help="A Stable-Baselines3 callback of your own: my_file.py:MyCallback or my_module:MyCallback; repeatable.",
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the folder's last checkpoint.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -147,6 +164,7 @@ def train(
         "scenario": scenario,
         "observe": observe and observe.value,
         "bounds": bounds,
+        "evaluate_network": evaluate_network,
         "shield": shield,
         "residual": residual,
         "initial": initial,
@@ -162,11 +180,16 @@ def train(
             from agents.learning.training import train
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(f"training needs {error.name}: {how_to_install('rl')}") from error
+        from agents.learning.callbacks import named_callbacks
+        from agents.learning.curve import evaluation_environment
         from agents.learning.environment import build, described
 
         set_by_options = {name: value for name, value in options.items() if value is not None}
         chosen = _chosen(config, settings or [], set_by_options, env or [], (network, estimator))
         played = described(build(chosen, 1), chosen)  # refuses what doesn't fit before there is a folder
+        if chosen.evaluate_network is not None:
+            evaluation_environment(chosen, 1)
+        callbacks = named_callbacks(callback or ())
         unit = played.error_unit
         folder = out or Path("runs") / "train" / _folder(chosen, played.environment)
     label = f"training {chosen.environment} on {chosen.observe}"
@@ -181,7 +204,7 @@ def train(
                     f"{evaluation.final_task_error:.3f} {unit}" + (f", |e| {disagreement:.3f}" if disagreement else "")
                 )
 
-        training = train(chosen, folder, resume=resume, on_progress=report)
+        training = train(chosen, folder, resume=resume, callbacks=callbacks, on_progress=report)
     best = max((each.mean_return for each in training.curve), default=None)
     files = {"best": folder / "best.npz", "last": folder / "last.npz"}
     files |= {"config": folder / "config.toml", "curve": folder / "curve.csv"}
@@ -194,6 +217,8 @@ def train(
         found |= {"seconds": training.seconds, "folder": str(folder)}
         print_json({**found, "files": {name: str(path) for name, path in files.items()}})
     elif training.finished:
+        if (reached := training.curve[-1].timesteps) < chosen.timesteps:
+            print_text(f"ended by a callback at {reached:,} of {chosen.timesteps:,} agent-steps; --resume goes on")
         print_text(f"best of {len(training.curve)} evaluations: return {best:.3f}; {training.seconds:.0f} s")
     if not training.finished:
         say("khop: interrupted; the same command with --resume continues from the last checkpoint")
@@ -247,7 +272,8 @@ def _folder(config: TrainingConfig, environment: str) -> str:
     shield = "" if config.shield is None else f"shield-{config.shield}"
     residual = "" if config.residual is None else f"residual-{config.residual}"
     policy = "" if config.policy == "mlp" else config.policy
-    extras = "bounds" * config.bounds, shield, residual, policy, "per_type" * config.per_type
+    network = "" if config.evaluate_network is None else f"evaluated-{config.evaluate_network}"
+    extras = network, "bounds" * config.bounds, shield, residual, policy, "per_type" * config.per_type
     return folder_name(
         environment, str(config.scenario or ""), config.observe, *extras, f"{config.algorithm}-{config.seed}"
     )
@@ -257,7 +283,10 @@ def _play(config: TrainingConfig, folder: Path) -> str:
     """The command that plays what was trained."""
     command = ["khop", "evaluate", str(config.environment)]
     command += ["--scenario", str(config.scenario)] if config.scenario else []
-    for name, value in config.as_dict()["arguments"].items():
+    arguments = config.as_dict()["arguments"]
+    if config.evaluate_network is not None:
+        arguments["network"] = config.evaluate_network
+    for name, value in arguments.items():
         if name in ("network", "estimator") and isinstance(value, str):
             command += [f"--{name}", value]
             continue
