@@ -49,6 +49,15 @@ from khop_env.physics import did_you_mean
 from khop_env.registry import make_batched
 from khop_env.results import learning_curves
 
+AIMED = (
+    "Differences in percent, with the wider of the intervals over episodes and over training seeds. *Open*: the "
+    "interval is wider than the aim, or trainings are missing. *Within 3 % of the truth*: learned on estimates, "
+    "against learned on true states. *Level with the best script*: learned on estimates is at least level with the "
+    "best of the tuned scripts on estimates; *better on three tasks*: clearly better. The same for *residual* "
+    "policies, which act on top of `leader_following`. *Bounds pay*: over a lossy network, certificates in the "
+    "observation make returns better. *Shielded*: trained and played in the certified filter, against the better of "
+    "`keep_right` and `go_to_goal` in the same filter.\n"
+)
 BY_HAND = "<!-- what follows is written by hand -->"
 
 
@@ -175,6 +184,7 @@ def _page(
     )
     yield "## What was aimed at\n"
     yield from summary(blocks)
+    yield "\n" + AIMED
     yield "\n## How it was measured\n"
     yield from _method(tasks, len(options.episodes))
     for name, figure in figures.items():
@@ -209,10 +219,11 @@ def _method(tasks: Sequence[StudyTask], episodes: int) -> Iterator[str]:
         "after the first quarter of an episode.\n"
     )
     yield (
-        "Scripts have the parameters that `khop tune` found for environment and scenario in continuous exchange, on "
-        "estimates (used on true states and over networks, too) or on neighbours only. `khop tune --env network=...` "
-        "would tune over a network; that wasn't done. Differences are paired by episode and seed: better or worse is "
-        "said only where the intervals over episodes and over training seeds both exclude 0, level where they don't "
+        "Scripts, of which the best is in bold, have the parameters that `khop tune` found for environment and "
+        "scenario in continuous exchange, on estimates (used on true states and over networks, too) or on neighbours "
+        "only. `khop tune --env network=...` would tune over a network; that wasn't done. Differences are paired by "
+        "episode and seed: better or worse is said only where the intervals over episodes and over training seeds "
+        "both exclude 0, level where they don't "
         f"but stay within 3 %. The wider of both is in the summary. {_estimators(tasks)}\n"
     )
     yield (

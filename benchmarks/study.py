@@ -108,6 +108,12 @@ class StudyTask:
         """Name in titles."""
         return f"{self.environment} on {self.scenario}"
 
+    @property
+    def short(self) -> str:
+        """Name in the summary: the environment's, or the scenario's where that says more."""
+        leader = self.environment == "leader_following_v0"
+        return self.scenario.partition(":")[0] if leader else self.environment.removesuffix("_v0")
+
 
 TASKS = (
     StudyTask("consensus_v0", "paper", 1_000_000),

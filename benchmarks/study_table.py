@@ -9,22 +9,22 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.outcomes import interval95, wilson95
-from benchmarks.study import CONTINUOUS, FILTER, LOSSY, NETWORKED, NETWORKS, SCRIPTS, SEEDS, Play
+from benchmarks.study import CONTINUOUS, FILTER, LOSSY, NETWORKED, NETWORKS, SEEDS, Play
 from benchmarks.study_measured import FLOORS, Block, Row
 from benchmarks.study_statistics import LEVEL, Difference, difference, iqm, iqm95, short
 from khop_env.observers import Exponential
 from khop_env.registry import scenario
 from khop_env.simulation import OBSERVE
 
-WITHIN = f"on estimates within {LEVEL:g} % of the truth"
-AT_LEAST = "at least level with the best tuned script"
-ON_TOP = f"{AT_LEAST}, residual"
-PAY = "bounds and ages pay over a lossy network, MLP"
-PAY_ATTENTION = "bounds and ages pay over a lossy network, attention"
+WITHIN = f"within {LEVEL:g} % of the truth"
+AT_LEAST = "level with the best script"
+ON_TOP = "residual: level with the best script"
+PAY = "bounds pay, MLP"
+PAY_ATTENTION = "bounds pay, attention"
 NO_COLLISION = "shielded: no collision"
-ABOVE = "shielded: larger return than the scripts in the same filter"
-ARRIVE = "shielded: more successes than the scripts in the same filter"
-THREE = "clearly better than the best tuned script on three tasks"
+ABOVE = "shielded: best return"
+ARRIVE = "shielded: most successes"
+THREE = "better on three tasks"
 AIMS = (WITHIN, AT_LEAST, ON_TOP, PAY, PAY_ATTENTION, NO_COLLISION, ABOVE, ARRIVE)
 """What is aimed at, in the order of the summary; `THREE` is counted from the others."""
 
@@ -49,15 +49,15 @@ class Finding(NamedTuple):
 
 def summary(blocks: Sequence[Block]) -> Iterator[str]:
     """A table of aims and tasks: reached, missed by how much, or open."""
-    found = [(block.task.label, finding) for block in blocks for finding in findings(block)]
-    yield "| aim | task | difference | verdict |"
+    found = [(block.task.short, finding) for block in blocks for finding in findings(block)]
+    yield "| aim | task | difference, % | verdict |"
     yield "|---|---|---|---|"
     for aim in AIMS:
         for label, finding in found:
             if finding.aim == aim:
                 verdict = finding.verdict.replace("missed", "**missed**")
                 yield f"| {aim} | {label} | {finding.brief} | {verdict} |"
-    for kind, aim in (("PPO on estimates", AT_LEAST), ("residual", ON_TOP)):
+    for kind, aim in (("", AT_LEAST), ("residual: ", ON_TOP)):
         chosen = [(label, finding) for label, finding in found if finding.aim in (aim, ABOVE)]
         better = [label for label, finding in chosen if finding.verdict.startswith("reached: better")]
         undecided = sum(finding.verdict.startswith("open") for _, finding in chosen)
@@ -65,7 +65,7 @@ def summary(blocks: Sequence[Block]) -> Iterator[str]:
             verdict = "reached"
         else:
             verdict = "open" if len(better) + undecided >= 3 else f"**missed** by {3 - len(better)}"
-        yield f"| {THREE}, {kind} | all | {len(better)} of {len(chosen)}: {', '.join(better) or 'none'} | {verdict} |"
+        yield f"| {kind}{THREE} | {', '.join(better) or 'none'} | {len(better)} of {len(chosen)} | {verdict} |"
 
 
 def table(block: Block) -> Iterator[str]:
@@ -79,19 +79,17 @@ def table(block: Block) -> Iterator[str]:
             yield _cells(_inside(row), row, _outcomes(row))
     else:
         yield f"In continuous exchange; bounds on estimates fall at {rates_of(block.task.scenario)} 1/s.\n"
-        yield "| policy | seeds | return | over seeds | IQM | error at the end | largest \\|e\\|, late | error/bound |"
-        yield "|---|---|---|---|---|---|---|---|"
+        yield "| policy | seeds | return | over seeds | IQM | error at the end | largest \\|e\\|, late |"
+        yield "|---|---|---|---|---|---|---|"
         for row in _shown(block, [Play(observe) for observe in OBSERVE], CONTINUOUS):
             largest = f"{_most(row, 'max_normalized_disagreement')}, {_most(row, 'late_normalized_disagreement')}"
-            bounded = _most(row, "max_error_to_bound")
-            yield _cells(_label(row, _best_mark(block, row)), row, (_error(row), largest, bounded))
+            yield _cells(_label(row, block), row, (_error(row), largest))
         yield "\nOver networks; scripts have the parameters of continuous exchange.\n"
         yield "| policy | on | seeds | return | over seeds | IQM | error at the end | error/certificate |"
         yield "|---|---|---|---|---|---|---|---|"
         for row in _shown(block, [Play(network=network) for network in NETWORKS], NETWORKED):
-            name = f"{row.name}{_best_mark(block, row)}" if not row.learned else f"PPO, {row.name}"
-            cells = (_error(row), _most(row, "max_error_to_bound"))
-            yield _cells(f"{name} | {(row.play.network or '').partition(':')[0]}", row, cells)
+            on = (row.play.network or "").partition(":")[0]
+            yield _cells(f"{_label(row, block)} | {on}", row, (_error(row), _most(row, "max_error_to_bound")))
     yield ""
     for finding in findings(block):
         aim = f" (aim: {finding.aim}: {finding.verdict})" if finding.aim else ""
@@ -168,10 +166,8 @@ def _navigation(block: Block) -> Iterator[Finding]:
     else:
         collided = shielded.values("collision")
         text = f"{int(collided.sum())} of {collided.size} episodes"
-        verdict = (
-            f"missed: {text}" if collided.any() else "reached" if _complete(shielded) else "open: seeds are missing"
-        )
-        yield Finding("shielded, collisions", text, NO_COLLISION, verdict, text)
+        verdict = "missed" if collided.any() else "reached" if _complete(shielded) else "open: seeds are missing"
+        yield Finding("shielded, collisions", text, NO_COLLISION, verdict, text.removesuffix(" episodes"))
     by_return, by_success = block.best(inside), block.best(inside, "success")
     title = f"shielded, return against {_script(by_return)} in the same filter"
     yield _compared(title, shielded, by_return, ABOVE)
@@ -186,25 +182,26 @@ def _compared(title: str, ours: Row | None, theirs: Row | None, aim: str, key: s
     found = None if ours is None or theirs is None else difference(ours, theirs, key)
     if ours is None or found is None:
         return Finding(title, "not trained yet", aim, "open: not trained yet", "")
-    brief = f"{found.relative} ± {short(found.half)} %" if math.isfinite(found.half) else f"{found.relative} (one seed)"
+    half = f" ± {short(found.half)}" if math.isfinite(found.half) else ""
+    brief = found.relative.removesuffix(" %") + half
     return Finding(title, str(found), aim, _verdict(aim, found, _complete(ours)) if aim else "", brief)
 
 
 def _verdict(aim: str, found: Difference, complete: bool) -> str:
     """What became of an aim: reached, missed by how much, or open."""
     if found.over_seeds is None:
-        return "open: one seed only"
+        return "open: one seed"
     low, high = found.percent - found.half, found.percent + found.half
     if aim == WITHIN:
         if high < -LEVEL:
             return f"missed by {short(-LEVEL - found.percent)} %"
-        return "reached" if low > -LEVEL else "open: the interval is wider than the aim"
+        return "reached" if low > -LEVEL else "open"
     if found.word == "worse":
         return f"missed by {short(-found.percent)} %"
     if found.word == "better":
         return "reached: better"
     if aim in (AT_LEAST, ON_TOP):
-        return "reached: level" if low > -LEVEL else "open: the interval is wider than the aim"
+        return "reached: level" if low > -LEVEL else "open"
     return "missed: no clear difference" if complete else "open: no clear difference yet"
 
 
@@ -220,21 +217,16 @@ def _shown(block: Block, plays: Sequence[Play], recipes: Container[str]) -> Iter
     yield from (row for row in block.rows if row.learned and row.play in plays and row.name in recipes)
 
 
-def _best_mark(block: Block, row: Row) -> str:
-    return " (best script)" if not row.learned and row is block.best(row.play) else ""
-
-
-def _label(row: Row, mark: str = "") -> str:
-    """Name of a row in continuous exchange."""
-    on = f", on {row.play.observe}" if row.play.observe not in row.name.split() else ""
-    if row.learned:
-        return f"PPO, {row.name}{on}"
-    return f"{row.name}, tuned{on}{mark}" if row.name in SCRIPTS else row.name
+def _label(row: Row, block: Block) -> str:
+    """Name of a row of a task other than navigation; that of the best script stands out."""
+    name = f"PPO {row.name}" if row.learned else f"**{row.name}**" if row is block.best(row.play) else row.name
+    shown = row.play.network is not None or row.name in FLOORS or row.play.observe in row.name.split()
+    return name if shown else f"{name}, on {row.play.observe}"
 
 
 def _inside(row: Row) -> str:
     """Name of a row in navigation."""
-    name = f"PPO, {row.name}" if row.learned else _script(row)
+    name = f"PPO {row.name}" if row.learned else _script(row)
     return f"{name}, {'in the filter' if row.play.inside else 'alone'}"
 
 
@@ -245,7 +237,7 @@ def _script(row: Row) -> str:
 
 def _cells(first: str, row: Row, rest: Sequence[str]) -> str:
     """A line of a table; without runs it says so."""
-    seeds = f"{len(row.seeds)} of {len(SEEDS)}" if row.learned else ""
+    seeds = f"{len(row.seeds)}/{len(SEEDS)}" if row.learned else ""
     if not row.seeds:
         return f"| {first} | {seeds} | " + " | ".join("" for _ in range(3 + len(rest))) + " |"
     returns = row.returns
@@ -255,7 +247,7 @@ def _cells(first: str, row: Row, rest: Sequence[str]) -> str:
     cells = (
         f"{mean:.4g} ± {over_episodes:.2g}",
         "" if over_seeds is None else f"± {over_seeds:.2g}",
-        f"{iqm(returns):.4g} [{low:.4g}, {high:.4g}]",
+        f"{iqm(returns):.4g} [{low:.3g}, {high:.3g}]",
         *rest,
     )
     return f"| {first} | {seeds} | {' | '.join(cells)} |"
