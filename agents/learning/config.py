@@ -80,6 +80,7 @@ class TrainingConfig:
         log_std: logarithm of the initial standard deviation of actions; PPO.
         log_std_end: its upper limit at the end, to which the limit falls linearly from `log_std`, and the entropy bonus
             to 0, so that exploration ends; a value above `log_std` for no limit and a constant bonus. PPO.
+        explore: fraction of the training after which limit and bonus begin to fall, below 1; PPO.
         reward_memory: number of the latest samples, about, over which the running standard deviation of returns is
             taken that rewards are divided by, so that small errors still count when large ones are over; 0 for all.
         huber: task error, in its unit, from which the training reward is linear in it; evaluation stays quadratic.
@@ -119,6 +120,7 @@ class TrainingConfig:
     entropy: float = 0.02
     log_std: float = 0.5
     log_std_end: float = -3.0
+    explore: float = 0.0
     reward_memory: int = 20_000
     huber: float = 1.0
     evaluations: int = 20
@@ -173,6 +175,8 @@ class TrainingConfig:
                 raise ValueError(f"{name} must be non-negative and finite; got {getattr(self, name)!r}")
         if not 0.0 <= self.entropy < math.inf:
             raise ValueError(f"entropy must be non-negative and finite; got {self.entropy!r}")
+        if not 0.0 <= self.explore < 1.0:
+            raise ValueError(f"explore must be at least 0 and below 1; got {self.explore!r}")
         for name in ("log_std", "log_std_end"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite; got {getattr(self, name)!r}")

@@ -60,6 +60,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "initial": None,
         "policy": "mlp",
         "log_std_end": 100.0,
+        "explore": 0.0,
         "reward_memory": 0,
         "evaluate_network": None,
         **stored,

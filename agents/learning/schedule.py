@@ -20,13 +20,13 @@ def follow_schedule(model: BaseAlgorithm, env: VecNormalize, config: TrainingCon
     Args:
         model: of Stable-Baselines3; changed.
         env: the environment that it trains on; changed.
-        config: its `log_std`, `log_std_end`, `entropy` and `reward_memory`.
+        config: its `log_std`, `log_std_end`, `explore`, `entropy` and `reward_memory`.
     """
     if config.reward_memory:
         env.ret_rms.count = min(env.ret_rms.count, config.reward_memory)
     if config.log_std_end > config.log_std or not isinstance(model, PPO):
         return
-    left = max(0.0, 1.0 - model.num_timesteps / config.timesteps)
+    left = min(1.0, max(0.0, 1.0 - model.num_timesteps / config.timesteps) / (1.0 - config.explore))
     limit = config.log_std_end + left * (config.log_std - config.log_std_end)
     with torch.no_grad():
         model.policy.log_std.clamp_(max=limit)

@@ -28,6 +28,11 @@ def test_exploration_falls_linearly(done, limit, entropy):
     assert scheduled(TINY, done)[:2] == pytest.approx((limit, entropy))
 
 
+@pytest.mark.parametrize(("done", "limit"), [(0, 1.0), (600, 1.0), (800, -1.0), (1000, -3.0)])
+def test_exploration_may_last_a_while(done, limit):
+    assert scheduled(dataclasses.replace(TINY, explore=0.6), done)[0] == pytest.approx(limit)
+
+
 def test_beyond_the_end_nothing_changes():
     assert scheduled(TINY, 5000)[:2] == pytest.approx((-3.0, 0.0))
 
@@ -68,6 +73,7 @@ def test_a_training_ends_without_exploration():
     ("wrong", "text"),
     [
         ({"log_std_end": float("nan")}, "log_std_end must be finite; got nan"),
+        ({"explore": 1.0}, "explore must be at least 0 and below 1; got 1.0"),
         ({"reward_memory": -1}, "reward_memory must be a non-negative integer; got -1"),
         ({"reward_memory": True}, "reward_memory must be a non-negative integer; got True"),
     ],
