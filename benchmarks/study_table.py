@@ -50,13 +50,13 @@ class Finding(NamedTuple):
 def summary(blocks: Sequence[Block]) -> Iterator[str]:
     """A table of aims and tasks: reached, missed by how much, or open."""
     found = [(block.task.short, finding) for block in blocks for finding in findings(block)]
-    yield "| aim | task | difference, % | verdict |"
+    yield "| aim | task | verdict | difference, % |"
     yield "|---|---|---|---|"
     for aim in AIMS:
         for label, finding in found:
             if finding.aim == aim:
                 verdict = finding.verdict.replace("missed", "**missed**")
-                yield f"| {aim} | {label} | {finding.brief} | {verdict} |"
+                yield f"| {aim} | {label} | {verdict} | {finding.brief} |"
     for kind, aim in (("", AT_LEAST), ("residual: ", ON_TOP)):
         chosen = [(label, finding) for label, finding in found if finding.aim in (aim, ABOVE)]
         better = [label for label, finding in chosen if finding.verdict.startswith("reached: better")]
@@ -65,7 +65,7 @@ def summary(blocks: Sequence[Block]) -> Iterator[str]:
             verdict = "reached"
         else:
             verdict = "open" if len(better) + undecided >= 3 else f"**missed** by {3 - len(better)}"
-        yield f"| {kind}{THREE} | {', '.join(better) or 'none'} | {len(better)} of {len(chosen)} | {verdict} |"
+        yield f"| {kind}{THREE} | {', '.join(better) or 'none'} | {verdict} | {len(better)} of {len(chosen)} |"
 
 
 def table(block: Block) -> Iterator[str]:

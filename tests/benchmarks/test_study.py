@@ -113,8 +113,8 @@ def test_the_aims_of_a_task():
     assert "| linear, on oracle |  | -10 ± 0 |" in lines
     columns = [line.count("|") - line.count("\\|") - 1 for line in lines.splitlines() if line.startswith("|")]
     assert set(columns) == {7, 8}
-    assert "| **missed** by 2.6 % |" in "\n".join(summary([block]))
-    assert "| better on three tasks | convoy | 1 of 1 | **missed** by 2 |" in "\n".join(summary([block]))
+    assert "| within 3 % of the truth | convoy | **missed** by 2.6 % | -5.6 ± " in "\n".join(summary([block]))
+    assert "| better on three tasks | convoy | **missed** by 2 | 1 of 1 |" in "\n".join(summary([block]))
 
 
 @pytest.mark.parametrize(("collided", "verdict"), [(0, "reached"), (1, "missed")])
