@@ -23,6 +23,8 @@ PolicyNetwork = Literal["mlp", "attention", "recurrent"]
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
+    "consensus_v0": {"gamma": 0.8},
+    "leader_following_v0": {"huber": 0.2, "log_std_end": -1.0, "explore": 0.6},
     "navigation_v0": {
         "nearest": True,
         "intervention": 0.5,
