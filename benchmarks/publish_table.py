@@ -21,33 +21,27 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from agents.learning import TrainingConfig
 from agents.learning.run_folder import write
 from agents.workers import Interrupted
 from benchmarks.publish import commit
 from benchmarks.study import (
-    CONTINUOUS,
     CORE_HOURS,
     NAVIGATION,
-    NETWORKED,
     RECIPES,
     SEEDS,
     TASKS,
-    Run,
     StudyTask,
     finished,
     runs,
     state_of,
     train_all,
 )
+from benchmarks.study_curves import FIGURES, draw, exploration
 from benchmarks.study_measured import EPISODES, Block, measure
 from benchmarks.study_table import largest_ratios, summary, table
-from khop_env.observers import FloatArray
 from khop_env.physics import did_you_mean
 from khop_env.registry import make_batched
-from khop_env.results import learning_curves
 
 AIMED = (
     "Differences in percent, with the wider of the intervals over episodes and over training seeds. *Open*: the "
@@ -58,6 +52,17 @@ AIMED = (
     "observation make returns better. *Shielded*: trained and played in the certified filter, against the better of "
     "`keep_right` and `go_to_goal` in the same filter.\n"
 )
+EXPLORING_FIGURE = [*FIGURES][-1]
+EXPLORING = """## Exploration that ends
+
+PPO adds noise to its actions, and an entropy bonus keeps it from becoming small. Left alone (`free exploration`), the
+noise may grow for as long as the training goes on. `exploration ends` limits the logarithm of its standard deviation
+to a value that falls from `log_std` to -3, and the bonus to 0. `estimate` is what `khop train` does by itself: it also
+divides rewards by the deviation of the latest returns only (`reward_memory`), since those of the first policies are
+hundreds of times larger, and the settings are those of each environment. Returns on the 32 episodes that select
+policies, without noise: mean over training seeds, and the extremes.
+"""
+
 BY_HAND = "<!-- what follows is written by hand -->"
 
 
@@ -89,7 +94,7 @@ def main(arguments: Sequence[str] | None = None, tasks: Sequence[StudyTask] = TA
     images = options.docs / "images"
     for folder in (page.parent, images):
         folder.mkdir(parents=True, exist_ok=True)
-    figures = dict(_figures(options.root, tasks, images))
+    figures = dict(draw(options.root, tasks, images))
     text = "\n".join(_page(options, tasks, blocks, figures, problems)).rstrip() + "\n"
     written = page.read_text(encoding="utf-8") if page.exists() else ""
     by_hand = "".join(written.partition(f"\n{BY_HAND}")[1:])  # stays
@@ -188,7 +193,12 @@ def _page(
     yield "\n## How it was measured\n"
     yield from _method(tasks, len(options.episodes))
     for name, figure in figures.items():
-        yield f"![Learning curves{name}](../images/{figure})\n"
+        if figure != EXPLORING_FIGURE:
+            yield f"![Learning curves{name}](../images/{figure})\n"
+    if EXPLORING_FIGURE in figures.values():
+        yield EXPLORING
+        yield f"![Learning curves with and without a schedule of exploration](../images/{EXPLORING_FIGURE})\n"
+        yield from exploration(options.root, tasks)
     for block in blocks:
         yield from table(block)
     if problems:
@@ -256,36 +266,6 @@ def _estimators(tasks: Sequence[StudyTask]) -> str:
         + ", ".join(f"`{name}` ({', '.join(where)})" for name, where in found.items())
         + "."
     )
-
-
-def _figures(root: Path, tasks: Sequence[StudyTask], images: Path) -> Iterator[tuple[str, str]]:
-    """What each figure shows beside learning curves, and its file, which it writes."""
-    for title, file, names in (
-        ("", "learning.png", (*CONTINUOUS, *NAVIGATION)),
-        (" over networks", "learning_networks.png", tuple(NETWORKED)),
-    ):
-        curves: dict[str, Mapping[str, tuple[FloatArray, FloatArray]]] = {}
-        for task in tasks:
-            named = {name: found for name in names if (found := _curve(root, task, name)) is not None}
-            if named:
-                curves[task.label] = named
-        if curves:
-            learning_curves(curves, images / file)
-            yield title, file
-
-
-def _curve(root: Path, task: StudyTask, name: str) -> tuple[FloatArray, FloatArray] | None:
-    """Agent-steps (T,) and mean returns (seeds, T) of the finished trainings of a kind; None if there is none."""
-    if name not in task.recipes:
-        return None
-    made = [run for seed in SEEDS if state_of(run := Run(task, name, seed), root).kind == "finished"]
-    found = [
-        np.loadtxt(run.folder(root) / "curve.csv", delimiter=",", skiprows=1, usecols=(0, 1), ndmin=2) for run in made
-    ]
-    if not found:
-        return None
-    shortest = min(map(len, found))
-    return found[0][:shortest, 0], np.array([curve[:shortest, 1] for curve in found])
 
 
 def _counted(problems: Sequence[str]) -> Iterator[tuple[str, int]]:

@@ -52,11 +52,13 @@ class Recipe:
         plays: on what its policies are played; the first is what they were trained on.
         settings: of `TrainingConfig`, where they aren't those that `khop train` uses by itself.
         network: over which it is trained; None for the environment's own.
+        seeds: training seeds.
     """
 
     plays: Sequence[Play] = (Play(),)
     settings: Mapping[str, Any] = field(default_factory=dict)
     network: str | None = None
+    seeds: Sequence[int] = SEEDS
 
 
 def _over(*networks: str) -> tuple[Play, ...]:
@@ -83,7 +85,12 @@ NAVIGATION: Mapping[str, Recipe] = {
     "shielded": Recipe((Play(inside=FILTER),), {"shield": SHIELD}),
     "not shielded": Recipe((Play(), Play(inside=FILTER))),
 }
-RECIPES: Mapping[str, Recipe] = {**CONTINUOUS, **NETWORKED, **NAVIGATION}
+FREE: Mapping[str, Any] = {"log_std_end": 100.0, "explore": 0.0, "reward_memory": 0}
+EXPLORATION: Mapping[str, Recipe] = {  # beside "estimate"; their learning curves are what is of interest
+    "free exploration": Recipe((), FREE, seeds=SEEDS[:3]),
+    "exploration ends": Recipe((), {**FREE, "log_std_end": -3.0}, seeds=SEEDS[:3]),
+}
+RECIPES: Mapping[str, Recipe] = {**CONTINUOUS, **NETWORKED, **NAVIGATION, **EXPLORATION}
 """All kinds of trainings by name."""
 
 
@@ -101,7 +108,7 @@ class StudyTask:
     environment: str
     scenario: str
     timesteps: int
-    recipes: Sequence[str] = (*CONTINUOUS, *NETWORKED)
+    recipes: Sequence[str] = (*CONTINUOUS, *NETWORKED, *EXPLORATION)
 
     @property
     def label(self) -> str:
@@ -189,7 +196,7 @@ def runs(
         for task in tasks
         if scenario in (None, task.scenario)
         for name in names
-        if name in task.recipes and name in chosen
+        if name in task.recipes and name in chosen and seed in RECIPES[name].seeds
     )
     return list(dict.fromkeys(found))
 

@@ -10,7 +10,20 @@ from agents.learning import training
 from agents.learning.config import TrainingConfig
 from agents.learning.config_file import write_config
 from benchmarks import publish_table, study_measured
-from benchmarks.study import DONE, FILTER, LOSSY, RECIPES, SCRIPTS, TASKS, Play, Run, StudyTask, finished, state_of
+from benchmarks.study import (
+    DONE,
+    EXPLORATION,
+    FILTER,
+    LOSSY,
+    RECIPES,
+    SCRIPTS,
+    TASKS,
+    Play,
+    Run,
+    StudyTask,
+    finished,
+    state_of,
+)
 from benchmarks.study import runs as runs_of
 from benchmarks.study_measured import KEPT, Block, Row
 from benchmarks.study_statistics import difference, iqm, iqm95
@@ -144,7 +157,7 @@ def test_the_aims_of_navigation(collided, verdict):
 
 def test_what_is_trained_first():
     order = [(run.task.scenario.partition(":")[0], run.recipe, run.seed) for run in runs_of()]
-    assert len(order) == len(set(order)) == 5 * sum(len(task.recipes) for task in TASKS)
+    assert len(order) == len(set(order)) == sum(len(RECIPES[name].seeds) for task in TASKS for name in task.recipes)
     first = order[:40]
     assert {recipe for _, recipe, _ in first} == {"estimate", "oracle"}
     assert [seed for *_, seed in first] == sorted(seed for *_, seed in first)
@@ -157,14 +170,16 @@ def test_what_is_trained_first():
 
 def test_settings_of_the_trainings(tmp_path):
     """Those that `khop train` uses by itself, and the network among the environment's arguments."""
-    for run in runs_of(seeds=[3]):
+    for run in runs_of(seeds=[2]):
         recipe = RECIPES[run.recipe]
         if state_of(run, tmp_path).kind == "impossible":
             assert "attention" in run.recipe
             continue
         config = run.config()
-        assert (config.seed, config.timesteps, config.scenario) == (3, run.task.timesteps, run.task.scenario)
+        assert (config.seed, config.timesteps, config.scenario) == (2, run.task.timesteps, run.task.scenario)
         assert config.arguments.get("network") == recipe.network
+        if run.recipe in EXPLORATION:
+            continue
         assert config.observe == recipe.plays[0].observe
         assert recipe.plays[0].network in (recipe.network, *(["ideal"] if run.recipe == "random" else []))
     assert Run(TASKS[-1], "shielded", 0).config() == TrainingConfig.suited(
@@ -197,7 +212,7 @@ def test_other_settings_than_todays_are_noticed(tmp_path):
     kind, text = state_of(run, tmp_path)
     assert kind == "other"
     assert f"{folder} was trained with other settings than today's" in text
-    assert "timesteps = 9 and not 4000; gamma = 0.5 and not 0.95" in text
+    assert "timesteps = 9 and not 4000; gamma = 0.5 and not 0.8" in text
 
 
 def test_learning_curves_of_costs_and_of_returns(tmp_path, monkeypatch):
