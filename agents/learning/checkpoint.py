@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import random
+import warnings
 from collections.abc import Mapping
 from operator import attrgetter
 from pathlib import Path
@@ -12,9 +13,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.learning.archive import read_arrays, write_arrays
+from agents.learning.replay import replay_state, restore_replay
 
 FORMAT = 2
 _SEED = ("entropy", "spawn_key", "pool_size", "n_children_spawned")  # of a seed sequence, from which keys are spawned
@@ -86,9 +89,10 @@ def restored(template: Any, stored: Any, where: str) -> Any:
 
 
 def model_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """The state of a Stable-Baselines3 model that its next update depends on, without a replay buffer."""
+    """The state of a Stable-Baselines3 model that its next update depends on."""
     _, variables = model._get_torch_save_params()
     return {
+        **({"replay": replay_state(model)} if isinstance(model, SAC) else {}),
         "parameters": model.get_parameters(),
         "variables": {name: attrgetter(name)(model) for name in variables},
         "counters": {name: getattr(model, name) for name in _COUNTERS},
@@ -103,6 +107,9 @@ def model_state(model: BaseAlgorithm) -> dict[str, Any]:
 
 def restore_model(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
     """Restore the saved state of a model in a new one with the same settings.
+
+    Warns:
+        UserWarning: if it is without its replay buffer, as earlier versions saved it.
 
     Raises:
         ValueError: if `stored` doesn't fit the model.
@@ -123,6 +130,14 @@ def restore_model(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
     for name in _LAST:
         expected = np.zeros(model.n_envs, bool) if name == "_last_episode_starts" else rows
         setattr(model, name, restored(expected, stored["last"][name], name))
+    if "replay" in stored and isinstance(model, SAC):
+        restore_replay(model, stored["replay"])
+    elif isinstance(model, SAC):
+        warnings.warn(
+            "an earlier version wrote this checkpoint, without SAC's replay buffer: the training goes on with an empty "
+            "one, and not as if it had never been interrupted",
+            stacklevel=2,
+        )
     torch.set_rng_state(_tensors(stored["random"]["torch"]))
     np.random.set_state(stored["random"]["numpy"])  # noqa: NPY002
     random.setstate(stored["random"]["python"])

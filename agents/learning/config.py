@@ -20,6 +20,7 @@ Algorithm = Literal["ppo", "sac"]
 ALGORITHMS = ("ppo", "sac")
 """Algorithms of `khop train`."""
 PolicyNetwork = Literal["mlp", "attention", "recurrent"]
+Critic = Literal["local", "state"]
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
@@ -67,6 +68,8 @@ class TrainingConfig:
         policy: kind of network: "mlp", "attention" over the slots, whose order and number then don't matter, or
             "recurrent", with memory.
         per_type: a network for each type of agent instead of one for all.
+        critic: what the value function sees: "local", an agent's features as its policy does, or "state", the true
+            global state beside these. Policies that are saved have none.
         timesteps: agent-steps in all, of all copies together.
         seed: seed of networks, episodes and exploration.
         num_envs: copies of the environment, each of N agents.
@@ -108,6 +111,7 @@ class TrainingConfig:
     algorithm: Algorithm = "ppo"
     policy: PolicyNetwork = "mlp"
     per_type: bool = False
+    critic: Critic = "local"
     timesteps: int = 2_000_000
     seed: int = 0
     num_envs: int = 64
@@ -159,6 +163,10 @@ class TrainingConfig:
                 Network.of(self.evaluate_network)
             except ValueError as error:
                 raise ValueError(f"evaluate_network: {error}") from None
+        if self.critic not in get_args(Critic):
+            raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
+        if self.critic == "state" and self.policy != "mlp":
+            raise ValueError(f"critic 'state' is for policy 'mlp', and not for {self.policy!r}")
         if self.per_type and self.algorithm == "sac":
             raise ValueError("per_type is for 'ppo'; 'sac' trains one network for all agents")
         for name in ("timesteps", "num_envs", "n_steps", "batch_size", "n_epochs", "evaluations"):

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from agents.evaluation import chosen_scenario
 from agents.learning.config import TrainingConfig
+from agents.learning.global_state import StateScaler
 from agents.learning.residual import Script
 from agents.learning.scaling import MOST, ObservationScaler
 from agents.learning.shielded import ShieldedSB3VecEnv
@@ -52,10 +53,12 @@ class TrainingVecEnv(VecEnvWrapper):
 
     Environments begin at different times of their first episodes, so that the ends of episodes are spread.
 
+    With `critic="state"` a row ends with features of the true global state, for the critic alone.
+
     Args:
         venv: the environment.
         scaler: computes the features.
-        config: its `huber`, `intervention` and `saturation` say how rewards are changed.
+        config: its `huber`, `intervention` and `saturation` say how rewards are changed, its `critic` what rows hold.
         script: acts beside the learner, whose actions are added to its own; None for none.
     """
 
@@ -71,8 +74,10 @@ class TrainingVecEnv(VecEnvWrapper):
             # PPO's actions are clipped to their space: a wider one shows how far they go; SAC's would be stretched
             most = WIDE if config.saturation else WHOLE
             actions = Box(-most, most, actions.shape, np.float32)
-        super().__init__(venv, Box(-MOST, MOST, (scaler.size,), np.float32), actions)
         self.batched, self.scaler, self.script, self._config = venv.batched, scaler, script, config
+        self.state = StateScaler.of(self.batched) if config.critic == "state" else None
+        size = scaler.size + (0 if self.state is None else self.state.size)
+        super().__init__(venv, Box(-MOST, MOST, (size,), np.float32), actions)
         self.shield = venv if isinstance(venv, ShieldedSB3VecEnv) else None
         self.source: KHopSB3VecEnv = venv.venv if isinstance(venv, ShieldedSB3VecEnv) else venv  # type: ignore[assignment]
         self.before = np.zeros(0, np.float32)  # observations of the previous step
@@ -86,7 +91,7 @@ class TrainingVecEnv(VecEnvWrapper):
         state, horizon = self.batched.get_state(), self.batched.settings.horizon
         staggered = np.arange(self.batched.num_envs) * horizon // self.batched.num_envs
         self.batched.set_state(dataclasses.replace(state, cycles=staggered))
-        return self.scaler(self.before, None)
+        return self._with_state(self.scaler(self.before, None))
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions (rows, m), with the script's added to them."""
@@ -112,6 +117,9 @@ class TrainingVecEnv(VecEnvWrapper):
         rows = np.flatnonzero(done)
         if rows.size:
             last = self.scaler(np.stack([infos[row]["terminal_observation"] for row in rows]), before[rows])
+            if self.state is not None:
+                states = np.stack([infos[row]["terminal_state"] for row in rows])
+                last = np.hstack([last, self.state(states)])
             for row, features in zip(rows, last, strict=True):
                 infos[row]["terminal_observation"] = features
             before = before.copy()
@@ -119,7 +127,15 @@ class TrainingVecEnv(VecEnvWrapper):
             if self.script is not None:
                 self.script.begin(np.flatnonzero(np.reshape(done, (self.batched.num_envs, -1)).any(axis=1)))
         self.before = current
-        return self.scaler(current, before), softened.reshape(-1).astype(np.float32), done, infos
+        features = self._with_state(self.scaler(current, before))
+        return features, softened.reshape(-1).astype(np.float32), done, infos
+
+    def _with_state(self, features: Float32Array) -> Float32Array:
+        """Features of observations, with those of the present global state beside them if the critic sees it."""
+        if self.state is None:
+            return features
+        states = np.repeat(self.state(self.batched.state()), len(self.batched.agents), axis=0)
+        return np.hstack([features, states])
 
 
 def training_environment(config: TrainingConfig) -> VecNormalize:

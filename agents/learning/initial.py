@@ -37,6 +37,11 @@ def begin_from(source: str, model: BaseAlgorithm, new: LearnedPolicy, env: EnvDe
         policy.reset(dataclasses.replace(env, shielded=True, control_period=period), [0])
         if differs := _difference(policy, new):
             raise PolicyFileError(differs)
+        if whole and policy.about.get("critic", "local") != new.about["critic"]:
+            raise PolicyFileError(
+                f"its critic is {policy.about.get('critic', 'local')!r}, and this run's is {new.about['critic']!r}: "
+                f"name {folder / 'last.npz'}, of which the policy alone is taken"
+            )
         if not whole:
             load_actor(model, policy.networks)
             return

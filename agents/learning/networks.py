@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from agents.learning.config import TrainingConfig
 from agents.learning.forward import Layers, Mlp, Network
 from agents.learning.learned import LearnedPolicy
 from agents.learning.scaling import ObservationScaler
+from agents.learning.state_critic import StateCriticPolicy, StateCriticSACPolicy
+
+REPLAY = 400_000  # agent-steps that SAC learns from, the last ones
 
 
 class PerTypeExtractor(nn.Module):
@@ -30,12 +33,13 @@ class PerTypeExtractor(nn.Module):
         features: number of features.
         hidden: widths of the hidden layers.
         types: columns of the one-hot.
+        state: number of the last features, of the global state, which only critics get.
     """
 
-    def __init__(self, features: int, hidden: Sequence[int], types: Sequence[int]) -> None:
+    def __init__(self, features: int, hidden: Sequence[int], types: Sequence[int], state: int = 0) -> None:
         super().__init__()
-        self.types = list(types)
-        self.actors = nn.ModuleList(_mlp(features, hidden) for _ in types)
+        self.types, self._own = list(types), features - state
+        self.actors = nn.ModuleList(_mlp(self._own, hidden) for _ in types)
         self.critics = nn.ModuleList(_mlp(features, hidden) for _ in types)
         self.latent_dim_pi = self.latent_dim_vf = len(self.types) * (hidden[-1] + 1)
 
@@ -45,7 +49,7 @@ class PerTypeExtractor(nn.Module):
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         """Latent features of the actor (batch, blocks)."""
-        return self._blocks(self.actors, features)
+        return self._blocks(self.actors, features[:, : self._own])
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
         """Latent features of the critic (batch, blocks)."""
@@ -67,18 +71,23 @@ class PerTypePolicy(ActorCriticPolicy):
         arguments: positional arguments of `ActorCriticPolicy`.
         types: columns of the one-hot.
         hidden: widths of the layers.
+        state: number of the last features, of the global state, which only critics get.
         keywords: keyword arguments of `ActorCriticPolicy`.
     """
 
-    def __init__(self, *arguments: Any, types: Sequence[int], hidden: Sequence[int], **keywords: Any) -> None:
-        self._types, self._hidden = list(types), list(hidden)
+    def __init__(
+        self, *arguments: Any, types: Sequence[int], hidden: Sequence[int], state: int = 0, **keywords: Any
+    ) -> None:
+        self._types, self._hidden, self._state = list(types), list(hidden), state
         super().__init__(*arguments, **keywords)
 
     def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = PerTypeExtractor(self.features_dim, self._hidden, self._types)  # type: ignore[assignment]
+        networks = PerTypeExtractor(self.features_dim, self._hidden, self._types, self._state)
+        self.mlp_extractor = networks  # type: ignore[assignment]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "types": self._types, "hidden": self._hidden}
+        own = {"types": self._types, "hidden": self._hidden, "state": self._state}
+        return {**super()._get_constructor_parameters(), **own}
 
 
 def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
@@ -101,13 +110,16 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
 def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
     common: dict[str, Any] = {"seed": config.seed, "gamma": config.gamma, "tensorboard_log": log, "device": "cpu"}
     net: dict[str, Any] = {"activation_fn": nn.ReLU}
+    sees_state, wrapped = config.critic == "state", cast(Any, env)
+    if sees_state:
+        net["state"] = wrapped.state.size
     if config.algorithm == "sac":
         return SAC(
-            "MlpPolicy",
+            StateCriticSACPolicy if sees_state else "MlpPolicy",
             env,
             learning_rate=config.learning_rate,
             batch_size=config.batch_size,
-            buffer_size=400_000,
+            buffer_size=REPLAY,
             train_freq=1,
             gradient_steps=4,
             learning_starts=4 * env.num_envs,
@@ -119,7 +131,7 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
         policy: Any = PerTypePolicy
         net |= {"types": list(types), "hidden": list(config.hidden)}
     else:
-        policy = "MlpPolicy"
+        policy = StateCriticPolicy if sees_state else "MlpPolicy"
         net["net_arch"] = {"pi": list(config.hidden), "vf": list(config.hidden)}
     rate = config.learning_rate
     return PPO(

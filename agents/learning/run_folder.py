@@ -63,6 +63,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "explore": 0.0,
         "reward_memory": 0,
         "evaluate_network": None,
+        "critic": "local",
         **stored,
     }  # of earlier versions
     differs = [key for key in current if stored.get(key) != current[key]]

@@ -17,7 +17,7 @@ METRE = 0.5  # lengths are in units of 2 m, speeds in units of 2 m/s
 SECOND = 2.0  # ages of information are in units of 0.5 s
 RATE = 0.25  # rates of change of positions are in units of 4 m/s
 MOST = 10.0  # features are clipped to this magnitude: agents under early policies move far away
-_SCALES = {"m": METRE, "m/s": METRE, "s": SECOND}
+SCALES = {"m": METRE, "m/s": METRE, "s": SECOND}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class ObservationScaler:
         """
         layouts = list(env.layouts.values())
         units = zip(*([field.unit for field in layout.fields] for layout in layouts), strict=True)
-        scale = np.array([next((_SCALES[u] for u in each if u in _SCALES), 1.0) for each in units], np.float32)
+        scale = np.array([next((SCALES[u] for u in each if u in SCALES), 1.0) for each in units], np.float32)
         names = max(layouts, key=lambda layout: len(layout.slots)).names
         valid = np.full(len(names), len(names))
         for column, name in enumerate(names):

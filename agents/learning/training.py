@@ -68,8 +68,8 @@ def train(
     The folder gets config.toml (every setting, as `khop train --config` takes it), config.json (the same and library
     versions), curve.csv, best.npz and last.npz (policies with their observation scales), checkpoint.npz (everything
     needed to resume) and TensorBoard logs. A keyboard interrupt saves and returns. A resumed run continues as if it had
-    not been interrupted, bit for bit with PPO; SAC begins with an empty replay buffer. With more `timesteps` than
-    before, a run continues beyond its end; PPO's learning rate then follows the schedule of the longer run.
+    not been interrupted, bit for bit. With more `timesteps` than before, a run continues beyond its end; PPO's learning
+    rate then follows the schedule of the longer run.
 
     Args:
         config: settings; with `resume` they must equal those of the folder, except that `timesteps` may be larger.

@@ -35,6 +35,13 @@ if TYPE_CHECKING:
     from agents.learning.curve import Evaluation
 
 
+class CriticOption(enum.StrEnum):
+    """What the value function sees."""
+
+    LOCAL = "local"
+    STATE = "state"
+
+
 class AlgorithmOption(enum.StrEnum):
     """Learning algorithm."""
 
@@ -111,6 +118,13 @@ def train(
         PolicyOption | None, typer.Option(help="Kind of network; by default mlp. See the guide on training.")
     ] = None,
     per_type: Annotated[bool | None, typer.Option("--per-type", help="One network for each type of agent.")] = None,
+    critic: Annotated[
+        CriticOption | None,
+        typer.Option(
+            help="What the value function sees in training: an agent's observation (local, the default), or the true "
+            "global state, too (state), as in MAPPO. Policies see observations only."
+        ),
+    ] = None,
     timesteps: Annotated[
         int | None, typer.Option(min=1, help="Agent-steps of all copies together; by default 2000000.")
     ] = None,
@@ -156,8 +170,8 @@ def train(
     them all. A policy trained with --shield is played inside the filter: filter:ppo:FOLDER, as the last line says.
 
     Ctrl-C saves the policy and ends, with exit status 130. --resume continues from the last of twenty checkpoints as if
-    nothing had happened; SAC begins with an empty replay buffer. With larger --timesteps a finished run continues; if
-    its scenario was edited since, it is refused.
+    nothing had happened. With larger --timesteps a finished run continues; if its scenario was edited since, it is
+    refused.
     """
     options = {
         "environment": environment,
@@ -171,6 +185,7 @@ def train(
         "algorithm": algo and algo.value,
         "policy": policy and policy.value,
         "per_type": per_type,
+        "critic": critic and critic.value,
         "timesteps": timesteps,
         "seed": seed,
         "num_envs": num_envs,
@@ -273,7 +288,8 @@ def _folder(config: TrainingConfig, environment: str) -> str:
     residual = "" if config.residual is None else f"residual-{config.residual}"
     policy = "" if config.policy == "mlp" else config.policy
     network = "" if config.evaluate_network is None else f"evaluated-{config.evaluate_network}"
-    extras = network, "bounds" * config.bounds, shield, residual, policy, "per_type" * config.per_type
+    critic = "state-critic" * (config.critic == "state")
+    extras = network, "bounds" * config.bounds, shield, residual, policy, "per_type" * config.per_type, critic
     return folder_name(
         environment, str(config.scenario or ""), config.observe, *extras, f"{config.algorithm}-{config.seed}"
     )

@@ -23,9 +23,10 @@ class KHopSB3VecEnv(VecEnv):
     """Rows are (environment, agent) pairs, the agents of an environment side by side; Stable-Baselines3's conventions.
 
     Environments whose episode ends are reset in the same step. The info of a row is empty until its episode ends; then
-    it has the last "terminal_observation", "TimeLimit.truncated" (a horizon is a truncation, after which PPO
-    bootstraps), "episode" as Stable-Baselines3's Monitor writes it (return "r" and length "l" of the row's episode,
-    seconds "t" since the environment was made), from which ep_rew_mean is logged, and the infos of `BatchedEnv`.
+    it has the last "terminal_observation", the global state at the end as "terminal_state", "TimeLimit.truncated" (a
+    horizon is a truncation, after which PPO bootstraps), "episode" as Stable-Baselines3's Monitor writes it (return "r"
+    and length "l" of the row's episode, seconds "t" since the environment was made), from which ep_rew_mean is logged,
+    and the infos of `BatchedEnv`.
 
     The rows of an environment have one seed, their options are merged, and attributes and methods are those of
     `batched`.
@@ -122,12 +123,13 @@ class KHopSB3VecEnv(VecEnv):
         over = terminated | truncated
         described: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if over.any():
-            last = observations.reshape(self.num_envs, -1)
+            last, state = observations.reshape(self.num_envs, -1), batched.state()
             columns = {key: value.reshape(-1).tolist() for key, value in infos.items()}
             returns, elapsed = self._returns.reshape(-1), round(time.perf_counter() - self._made, 6)
             for row in np.flatnonzero(np.repeat(over, agents)).tolist():
                 described[row] = {key: values[row] for key, values in columns.items()}
                 described[row]["terminal_observation"] = last[row]
+                described[row]["terminal_state"] = state[row // agents]
                 described[row]["TimeLimit.truncated"] = bool(truncated[row // agents])
                 length = int(self._lengths[row // agents])
                 described[row]["episode"] = {"r": round(float(returns[row]), 6), "l": length, "t": elapsed}

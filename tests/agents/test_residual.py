@@ -48,7 +48,7 @@ def acts_alike(env, first, second, cycles=12):
         ("leader_following_v0", "convoy", "leader_following", {"observe": "oracle", "bounds": True}),
         ("leader_following_v0", "mixed_fleet", "leader_following", {"arguments": {"network": "wifi"}}),
         ("navigation_v0", None, "go_to_goal", {"algorithm": "sac"}),
-        ("navigation_v0", None, "keep_right", {"shield": "none"}),
+        ("navigation_v0", None, "keep_right", {"shield": "none", "critic": "state"}),
         ("navigation_v0", None, "orca:horizon=1", {"nearest": True}),
         ("navigation_v0", None, "robust_barrier", {"bounds": True}),
     ],

@@ -46,7 +46,8 @@ def test_rows_are_those_of_the_gymnasium_environment(environment, name):
             if not dones[row]:
                 assert info == {}
                 continue
-            assert set(info) == {"terminal_observation", "TimeLimit.truncated", "episode", *info_keys(environment)}
+            of_the_end = {"terminal_observation", "terminal_state", "TimeLimit.truncated", "episode"}
+            assert set(info) == of_the_end | set(info_keys(environment))
             assert info["terminal_observation"].tobytes() == infos_2["final_obs"][row].tobytes()
             assert info["TimeLimit.truncated"] is bool(truncated[row])
             for key in info_keys(environment):
