@@ -15,6 +15,7 @@ from agents.learning.global_state import StateScaler
 from agents.learning.residual import Script
 from agents.learning.scaling import MOST, ObservationScaler
 from agents.learning.shielded import ShieldedSB3VecEnv
+from agents.learning.slots import SlotScaler
 from agents.policies import needs, safety_filter
 from agents.policy import EnvDescription, describe
 from khop_env.env import BatchedEnv
@@ -65,7 +66,7 @@ class TrainingVecEnv(VecEnvWrapper):
     def __init__(
         self,
         venv: KHopSB3VecEnv | ShieldedSB3VecEnv,
-        scaler: ObservationScaler,
+        scaler: ObservationScaler | SlotScaler,
         config: TrainingConfig,
         script: Script | None = None,
     ) -> None:
@@ -76,7 +77,8 @@ class TrainingVecEnv(VecEnvWrapper):
             actions = Box(-most, most, actions.shape, np.float32)
         self.batched, self.scaler, self.script, self._config = venv.batched, scaler, script, config
         self.state = StateScaler.of(self.batched) if config.critic == "state" else None
-        size = scaler.size + (0 if self.state is None else self.state.size)
+        features = scaler(np.zeros((1, *(venv.observation_space.shape or ())), np.float32), None)
+        size = features.shape[1] + (0 if self.state is None else self.state.size)
         super().__init__(venv, Box(-MOST, MOST, (size,), np.float32), actions)
         self.shield = venv if isinstance(venv, ShieldedSB3VecEnv) else None
         self.source: KHopSB3VecEnv = venv.venv if isinstance(venv, ShieldedSB3VecEnv) else venv  # type: ignore[assignment]
@@ -146,7 +148,11 @@ def training_environment(config: TrainingConfig) -> VecNormalize:
     if config.shield is not None:
         rows = ShieldedSB3VecEnv(inner, safety_filter(str(config.shield), None, config.bounds))
     found = described(batched, config)
-    scaler = ObservationScaler.of(found, config.rates, config.nearest)
+    scaler: ObservationScaler | SlotScaler
+    if config.policy == "attention":
+        scaler = SlotScaler.of(found, config.rates)
+    else:
+        scaler = ObservationScaler.of(found, config.rates, config.nearest)
     script = None if config.residual is None else Script(config.residual, found, batched.num_envs)
     wrapped = TrainingVecEnv(rows, scaler, config, script)
     return VecNormalize(wrapped, norm_obs=False, norm_reward=True, gamma=config.gamma)

@@ -91,7 +91,62 @@ class Mlp:
         return cls(read_layers(arrays, name, layers, inputs, outputs))
 
 
-NETWORKS: Mapping[str, type[Network]] = {each.kind: each for each in (Mlp,)}
+@dataclass(frozen=True, eq=False)
+class Attention:
+    """Attention over slots, as in `agents.learning.attention.SlotAttention`, and layers after it.
+
+    Attributes:
+        encoder: (weight (width, slot + own), bias (width,)).
+        scores: (heads, width) weight of the scores.
+        layers: of which the first takes the own features and the averages, own + width.
+    """
+
+    encoder: tuple[Float32Array, Float32Array]
+    scores: Float32Array
+    layers: Layers
+    kind: ClassVar[str] = "attention"
+
+    @property
+    def own(self) -> int:
+        """Number of own features, which come first; those of the slots follow."""
+        return int(self.layers[0][0].shape[1] - self.scores.shape[1])
+
+    def __call__(self, features: Float32Array, memory: Memory) -> tuple[Float32Array, Memory]:
+        """Outputs (..., m), and no memory."""
+        weight, bias = self.encoder
+        rows, width = features.shape[:-1], weight.shape[1] - self.own
+        own, slots = features[..., : self.own], features[..., self.own :].reshape(*rows, -1, width)
+        valid = slots[..., :1] > 0.5
+        beside = np.broadcast_to(own[..., None, :], (*slots.shape[:-1], self.own))
+        encoded = np.concatenate([np.where(valid, slots, np.float32(0.0)), beside], axis=-1) @ weight.T + bias
+        np.maximum(encoded, 0.0, out=encoded)
+        scores = np.where(valid, encoded @ self.scores.T, np.float32(-np.inf))
+        most = np.where(valid.any(axis=-2, keepdims=True), scores.max(axis=-2, keepdims=True), np.float32(0.0))
+        weights = np.exp(scores - most)
+        weights /= np.maximum(weights.sum(axis=-2, keepdims=True), 1.0)  # below 1 without valid slots: all are 0
+        shares = encoded.reshape(*scores.shape, -1) * weights[..., None]
+        return applied(self.layers, np.concatenate([own, shares.sum(axis=-3).reshape(*rows, -1)], axis=-1)), None
+
+    def arrays(self) -> dict[str, Float32Array]:
+        """All arrays, by their names in a file."""
+        weight, bias = self.encoder
+        return {"encoder/weight": weight, "encoder/bias": bias, "scores": self.scores, **named(self.layers)}
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, np.ndarray], name: str, layers: int, inputs: int, outputs: int) -> Attention:
+        """The network in a file, as `Network.read`; `inputs` are the own features and those of one slot."""
+        heads, width = (*arrays[f"{name}/scores"].shape, 0, 0)[:2]
+        scores = numbers(arrays, f"{name}/scores", (heads, width))
+        require(heads > 0 and width > 0 and width % heads == 0, f"{name}/scores has shape {scores.shape}")
+        encoder = numbers(arrays, f"{name}/encoder/weight", (width, inputs))
+        first = arrays[f"{name}/0/weight"].shape
+        own = first[1] - width if len(first) == 2 else 0
+        require(0 < own < inputs, f"{name}/0/weight has shape {first}")
+        bias = numbers(arrays, f"{name}/encoder/bias", (width,))
+        return cls((encoder, bias), scores, read_layers(arrays, name, layers, own + width, outputs))
+
+
+NETWORKS: Mapping[str, type[Network]] = {each.kind: each for each in (Mlp, Attention)}
 """Networks by kind."""
 
 

@@ -14,6 +14,7 @@ from agents.learning.forward import Memory, Network
 from agents.learning.policy_file import PolicyFileError, read_policy, write_policy
 from agents.learning.residual import make_script
 from agents.learning.scaling import RATE, ObservationScaler
+from agents.learning.slots import SlotScaler, one_slot
 from agents.policy import EnvDescription, Observations, Policy, require_description, require_reset
 from khop_env.env.layout import Float32Array
 
@@ -35,7 +36,7 @@ class LearnedPolicy:
 
     Attributes:
         environment: name of the environment it was trained for.
-        columns: names of the columns of an observation.
+        columns: names of the columns of an observation; with attention those of one with one slot.
         action_size: number of entries of an action.
         squash: whether outputs pass through tanh (SAC); otherwise they are clipped to [-1, 1] (PPO).
         networks: by agent type, or under "" for all types.
@@ -48,7 +49,7 @@ class LearnedPolicy:
     action_size: int
     squash: bool
     networks: Mapping[str, Network]
-    scaler: ObservationScaler
+    scaler: ObservationScaler | SlotScaler
     about: Mapping[str, Any]
     _types: dict[str, str] = field(default_factory=dict, init=False, repr=False)
     _before: Float32Array | None = field(default=None, init=False, repr=False)
@@ -71,7 +72,7 @@ class LearnedPolicy:
         require_description(env)
         if env.environment != self.environment:
             raise PolicyFileError(f"it was trained for {self.environment}, not for {env.environment}")
-        sizes, columns = sorted(set(env.action_sizes.values())), columns_of(env)
+        sizes, columns = sorted(set(env.action_sizes.values())), self._columns(env)
         where = self.about.get("scenario", "another scenario")
         if len({len(layout) for layout in env.layouts.values()}) > 1:
             raise PolicyFileError("it needs uniform observations: create the environment with uniform=True")
@@ -134,6 +135,9 @@ class LearnedPolicy:
             agent: np.clip(output + script[agent] if script else output, -1.0, 1.0)
             for agent, output in zip(observations, outputs, strict=True)
         }
+
+    def _columns(self, env: EnvDescription) -> tuple[str, ...]:
+        return columns_of(env, isinstance(self.scaler, SlotScaler))
 
     def _outputs(self, kind: str, whose: str, features: Float32Array) -> Float32Array:
         values, self._memories[whose] = self.networks[kind](features, self._memories.get(whose))
@@ -224,8 +228,10 @@ def _shipped() -> str:
     return ", ".join(sorted(path.stem.replace("@", " on ") for path in PRETRAINED.glob("*.npz"))) or "none"
 
 
-def columns_of(env: EnvDescription) -> tuple[str, ...]:
-    """Column names of uniform observations, from the agent with most slots."""
+def columns_of(env: EnvDescription, by_slot: bool = False) -> tuple[str, ...]:
+    """Column names of uniform observations, from the agent with most slots; `by_slot` as if there were one slot."""
+    if by_slot:
+        return one_slot(list(env.layouts.values()))[0]
     return max(env.layouts.values(), key=lambda layout: len(layout.slots)).names
 
 

@@ -13,10 +13,12 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from agents.learning.attention import SlotAttention
 from agents.learning.config import TrainingConfig
-from agents.learning.forward import Layers, Mlp, Network
+from agents.learning.forward import Attention, Layers, Mlp, Network
 from agents.learning.learned import LearnedPolicy
 from agents.learning.scaling import ObservationScaler
+from agents.learning.slots import SlotScaler
 from agents.learning.state_critic import StateCriticPolicy, StateCriticSACPolicy
 
 REPLAY = 400_000  # agent-steps that SAC learns from, the last ones
@@ -109,7 +111,7 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
 
 def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
     common: dict[str, Any] = {"seed": config.seed, "gamma": config.gamma, "tensorboard_log": log, "device": "cpu"}
-    net: dict[str, Any] = {"activation_fn": nn.ReLU}
+    net: dict[str, Any] = {"activation_fn": nn.ReLU, **_extractor(config, env)}
     sees_state, wrapped = config.critic == "state", cast(Any, env)
     if sees_state:
         net["state"] = wrapped.state.size
@@ -149,6 +151,18 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
     )
 
 
+def _extractor(config: TrainingConfig, env: VecEnv) -> dict[str, Any]:
+    """What a policy of Stable-Baselines3 gets to extract features; actor and critic have extractors of their own."""
+    if config.policy != "attention":
+        return {}
+    scaler: SlotScaler = env.scaler  # type: ignore[attr-defined]
+    return {
+        "features_extractor_class": SlotAttention,
+        "features_extractor_kwargs": {"own": len(scaler.own), "slot": len(scaler.slot)},
+        "share_features_extractor": False,
+    }
+
+
 def _divisor(samples: int, wanted: int) -> int:
     """The batch size near the wanted value that divides the number of samples per update."""
     count = max(1, round(samples / wanted))
@@ -181,7 +195,11 @@ def actor_networks(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Netw
     """
     policy: Any = model.policy
     if isinstance(model, SAC) or not isinstance(policy.mlp_extractor, PerTypeExtractor):
-        return {"": Mlp(_layers(_actor(model)))}
+        extractor, layers = _actor(model)
+        if isinstance(extractor, SlotAttention):
+            (encoder,), scores = _layers(extractor.encoder), extractor.scores.weight.detach().numpy().copy()
+            return {"": Attention(encoder, scores, _layers(layers))}
+        return {"": Mlp(_layers(layers))}
     extractor, head = policy.mlp_extractor, policy.action_net
     networks: dict[str, Network] = {}
     weight, bias = (parameter.detach().numpy().copy() for parameter in (head.weight, head.bias))
@@ -201,19 +219,19 @@ def load_actor(model: BaseAlgorithm, networks: Mapping[str, Network]) -> None:
     """
     if "" not in networks:
         raise ValueError("a policy's file with a network for each type isn't enough: name the folder of its run")
-    linear = [layer for layer in _actor(model) if isinstance(layer, nn.Linear)]
+    extractor, layers = _actor(model)
+    parameters = [*extractor.parameters(), *(each for layer in layers for each in layer.parameters())]
     with torch.no_grad():
-        for layer, (weight, bias) in zip(linear, networks[""].layers, strict=True):
-            layer.weight.copy_(torch.as_tensor(weight))
-            layer.bias.copy_(torch.as_tensor(bias))
+        for parameter, array in zip(parameters, networks[""].arrays().values(), strict=True):  # in the same order
+            parameter.copy_(torch.as_tensor(array))
 
 
-def _actor(model: BaseAlgorithm) -> list[nn.Module]:
-    """The modules from features to the action's mean, of a model with one network for all agents."""
+def _actor(model: BaseAlgorithm) -> tuple[nn.Module, list[nn.Module]]:
+    """The extractor, and the modules from there to the action's mean, of a model with one network for all agents."""
     policy: Any = model.policy
     if isinstance(model, SAC):
-        return [*policy.actor.latent_pi, policy.actor.mu]
-    return [*policy.mlp_extractor.policy_net, policy.action_net]
+        return policy.actor.features_extractor, [*policy.actor.latent_pi, policy.actor.mu]
+    return policy.pi_features_extractor, [*policy.mlp_extractor.policy_net, policy.action_net]
 
 
 def exported(
@@ -222,7 +240,7 @@ def exported(
     environment: str,
     columns: Sequence[str],
     types: Sequence[str],
-    scaler: ObservationScaler,
+    scaler: ObservationScaler | SlotScaler,
     about: dict[str, Any],
 ) -> LearnedPolicy:
     """The model's actor as a policy that needs neither torch nor Stable-Baselines3.
@@ -231,7 +249,7 @@ def exported(
         model: PPO or SAC.
         config: settings of the run.
         environment: name of the environment.
-        columns: names of the observation's columns.
+        columns: names of the observation's columns, as `LearnedPolicy` has them.
         types: names of the agent types, in the order of the one-hot.
         scaler: scaler of observations.
         about: settings and versions of the training run.

@@ -13,8 +13,9 @@ import numpy as np
 
 from agents.learning.archive import ArchiveError, read_arrays, write_arrays
 from agents.learning.config import ALGORITHMS
-from agents.learning.forward import NETWORKS, Network, numbers, require
+from agents.learning.forward import NETWORKS, Attention, Network, numbers, require
 from agents.learning.scaling import ObservationScaler
+from agents.learning.slots import SlotScaler
 
 FORMAT = 1
 MOST_BYTES = 2**28  # limit on a policy's arrays; the shipped policies have less than a thousandth of it
@@ -46,8 +47,9 @@ def write_policy(path: Path, fields: Mapping[str, Any]) -> None:
         "layers": {kind: len(network.layers) for kind, network in networks.items()},
         "about": dict(fields["about"]),
     }
-    scaler: ObservationScaler = fields["scaler"]
-    arrays: dict[str, Any] = {name: getattr(scaler, name) for name in ("scale", "rate", *_INDICES)}
+    scaler: ObservationScaler | SlotScaler = fields["scaler"]
+    one = scaler.one if isinstance(scaler, SlotScaler) else scaler
+    arrays: dict[str, Any] = {name: getattr(one, name) for name in ("scale", "rate", *_INDICES)}
     for kind, network in networks.items():
         arrays |= {f"{kind}/{name}": array for name, array in network.arrays().items()}
     write_arrays(path, {"meta": np.array(json.dumps(meta)), **arrays}, compress=True)
@@ -97,11 +99,17 @@ def _fields(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     require(about["algorithm"] in ALGORITHMS, f"the algorithm is {about['algorithm']!r:.40}")
     require(isinstance(counts, dict) and bool(counts), "it has no networks")
     require(all(type(count) is int and 0 < count <= 100 for count in counts.values()), "numbers of layers are invalid")
-    scaler = _scaler(arrays, len(columns))
+    one = _scaler(arrays, len(columns))
     network = meta.get("network", "mlp")  # in files of earlier versions
     require(isinstance(network, str) and network in NETWORKS, f"its network is {network!r:.40}")
     read, outputs = NETWORKS[network].read, meta["action_size"]
-    networks = {kind: read(arrays, kind, count, scaler.size, outputs) for kind, count in counts.items()}
+    networks = {kind: read(arrays, kind, count, one.size, outputs) for kind, count in counts.items()}
+    scaler: ObservationScaler | SlotScaler = one
+    if network == "attention":
+        scaler = SlotScaler(one)
+        own = [len(scaler.own), *(each.own for each in networks.values() if isinstance(each, Attention))]
+        require("slot0.valid" in columns[1:] and columns.index("slot0.valid") == one.valid.min(), "slots are misplaced")
+        require(len(set(own)) == 1, f"it has {own} own features")
     return {
         "environment": meta["environment"],
         "columns": tuple(columns),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,9 +65,32 @@ class ObservationScaler:
             ValueError: if own positions are in different columns for different agents.
         """
         layouts = list(env.layouts.values())
-        units = zip(*([field.unit for field in layout.fields] for layout in layouts), strict=True)
-        scale = np.array([next((SCALES[u] for u in each if u in SCALES), 1.0) for each in units], np.float32)
+        units = list(zip(*([field.unit for field in layout.fields] for layout in layouts), strict=True))
         names = max(layouts, key=lambda layout: len(layout.slots)).names
+        return cls.of_columns(env, names, units, rates, nearest)
+
+    @classmethod
+    def of_columns(
+        cls,
+        env: EnvDescription,
+        names: Sequence[str],
+        units: Sequence[Collection[str]],
+        rates: bool,
+        nearest: bool = False,
+    ) -> ObservationScaler:
+        """The scaler of observations with certain columns, of which the own ones are those of the environment.
+
+        Args:
+            env: the environment.
+            names: of the columns.
+            units: of each column; of several agents where these differ.
+            rates: as for `of`.
+            nearest: likewise.
+
+        Raises:
+            ValueError: as `of`.
+        """
+        scale = np.array([next((SCALES[u] for u in each if u in SCALES), 1.0) for each in units], np.float32)
         valid = np.full(len(names), len(names))
         for column, name in enumerate(names):
             slot, _, rest = name.partition(".")
@@ -75,7 +98,7 @@ class ObservationScaler:
                 valid[column] = names.index(f"{slot}.valid")
         own = _own_position(env)
         moving = [*own, *_vectors(names, len(own), "position")] if rates else []
-        headed, heading = _headings(layouts)
+        headed, heading = _headings(list(env.layouts.values()))
         planar = []
         if len(own) == 2 and len(headed):
             planar = _vectors(names, 2, "position", "displacement")

@@ -237,7 +237,7 @@ class _Run(BaseCallback):
             "residual": self.learner.script and self.learner.script.name,
             "versions": versions(),
         }
-        env, columns = self.description.environment, columns_of(self.description)
+        env, columns = self.description.environment, columns_of(self.description, self.config.policy == "attention")
         return exported(self.algorithm, self.config, env, columns, self.types, self.learner.scaler, about)
 
     def _save(self) -> None:
