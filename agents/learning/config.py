@@ -26,6 +26,7 @@ SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
     "consensus_v0": {"gamma": 0.8},
     "leader_following_v0": {"huber": 0.2, "log_std_end": -1.0, "explore": 0.6},
+    "attention": {"nearest": False},
     "navigation_v0": {
         "nearest": True,
         "intervention": 0.5,
@@ -41,7 +42,7 @@ SUITED: Mapping[str, Mapping[str, Any]] = {
         "arguments": {"penalty": 0.1, "goal_radius": 0.1},  # it learns to come nearer than it has to
     },
 }
-"""By algorithm and environment: settings where others than the defaults suit it."""
+"""By algorithm, kind of network and environment: settings where others than the defaults suit it."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +204,7 @@ class TrainingConfig:
 
     @classmethod
     def suited(cls, environment: Environment, **settings: Any) -> TrainingConfig:
-        """Settings with defaults that suit environment and algorithm, as `khop train` has them.
+        """Settings with defaults that suit environment, algorithm and kind of network, as `khop train` has them.
 
         Args:
             environment: as for the class.
@@ -213,7 +214,8 @@ class TrainingConfig:
             ValueError: as the class.
         """
         own = SUITED.get(environment, {}) if isinstance(environment, str) else {}
-        found = {**SUITED.get(str(settings.get("algorithm")), {}), **own, **settings}
+        algorithm, policy = (SUITED.get(str(settings.get(name)), {}) for name in ("algorithm", "policy"))
+        found = {**algorithm, **own, **policy, **settings}
         arguments = {**own.get("arguments", {}), **settings.get("arguments", {})}
         return cls(environment, **{**found, "arguments": arguments})
 
