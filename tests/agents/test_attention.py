@@ -121,6 +121,7 @@ def test_features_are_those_of_each_slot(environment):
 @pytest.mark.parametrize("changes", [{}, SAC, {"residual": "formation"}], ids=["ppo", "sac", "residual"])
 def test_the_saved_policy_acts_like_the_model(changes, tmp_path):
     """NumPy's forward pass against torch; actor and critic share nothing."""
+    torch.set_num_threads(1)  # as `train` does
     run = _Run(dataclasses.replace(FLEET, **changes), None, None, None)
     run.learn()
     policy = run.algorithm.policy
