@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from khop_env.network import Network
+from khop_env.observers.networked import missed_rounds
 from tests.env.playing import (
     batched,
     parallel,
@@ -176,6 +177,12 @@ def drawn(env):
     return env.simulator.observers.drawn(env.simulator.state)
 
 
+def limits_and_missed(env):
+    """The information limit of each estimate, and rounds missed on each link."""
+    observers, state = env.simulator.observers, env.simulator.state
+    return observers.limits(state, np.empty((observers.layout.size, env.num_envs))), missed_rounds(observers, state)
+
+
 def test_partial_resets_start_a_new_network():
     """The environments that go on keep every bit; those that begin anew have those of their own seed."""
     env = batched("consensus_v0", num_envs=3, network=DRAWN, bounds=True)
@@ -214,6 +221,10 @@ def test_an_episode_over_ranges_is_that_over_the_network_it_drew(estimator):
         observations = env.step(actions)[0]
         for number, each in enumerate(fixed):
             assert same(each.step(actions[number][None])[0][0], observations[number])
+    limits, missed = limits_and_missed(env)
+    for number, each in enumerate(fixed):
+        for values, expected in zip((limits, missed), limits_and_missed(each), strict=True):
+            np.testing.assert_array_equal(values[:, number], expected[:, 0])
     before = drawn(env)
     env.reset(env_ids=[1])
     assert drawn(env)[0] == before[0]
