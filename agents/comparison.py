@@ -140,7 +140,7 @@ class Comparison:
         if any(row.compared for row in self.rows):
             networks = [pl.lit(row.network).alias("network") for row in self.rows]
             frames = [frame.with_columns(network) for frame, network in zip(frames, networks, strict=True)]
-        return pl.concat(frames)
+        return pl.concat(frames, how="diagonal")  # networks with ranges have columns of their own
 
 
 def compare(

@@ -16,7 +16,7 @@ from agents.policies import make_policy
 from agents.policy import EnvDescription, Policy, batched_of, by_agent, describe, policy_seeds, require_policy
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, Networked
 from khop_env.registry import Environment, find_task
 from khop_env.registry import scenario as load_scenario
 from khop_env.results.dataset import EpisodeDataset
@@ -52,6 +52,7 @@ class Episodes:
             moved by 0.1 m in the last 2 s; "intervention", mean over agents and time of a filter's changes of
             their inputs in m/s, and "infeasible", share of agents and time in which its guarantee had to be begun anew,
             nan without a filter. Nothing in other environments.
+        drawn: (E,) each, what the episodes drew from the ranges of their network, by name: "loss", "burst", ...
     """
 
     seed: np.ndarray
@@ -65,6 +66,7 @@ class Episodes:
     task_error: FloatArray
     time: FloatArray
     outcomes: Mapping[str, FloatArray] = field(default_factory=dict)
+    drawn: Mapping[str, FloatArray] = field(default_factory=dict)
 
     __repr__ = brief
 
@@ -74,10 +76,11 @@ class Episodes:
         values = {
             each.name: np.concatenate([getattr(part, each.name) for part in parts], axis=-1)
             for each in fields(Episodes)
-            if each.name not in ("time", "outcomes")
+            if each.name not in ("time", "outcomes", "drawn")
         }
         outcomes = {name: np.concatenate([part.outcomes[name] for part in parts]) for name in parts[0].outcomes}
-        return Episodes(**values, time=parts[0].time, outcomes=outcomes)
+        drawn = {name: np.concatenate([part.drawn[name] for part in parts]) for name in parts[0].drawn}
+        return Episodes(**values, time=parts[0].time, outcomes=outcomes, drawn=drawn)
 
     def frame(self, policy: str, env: EnvDescription) -> pl.DataFrame:
         """A tidy data frame with one row per episode: environment, scenario, mode, policy and measurements.
@@ -89,10 +92,11 @@ class Episodes:
         import polars as pl
 
         where = {"environment": env.environment, "scenario": env.scenario, "observe": env.observe, "policy": policy}
-        excluded = ("task_error", "time", "returns", "seed", "outcomes")
+        excluded = ("task_error", "time", "returns", "seed", "outcomes", "drawn")
         rest = [each.name for each in fields(self) if each.name not in excluded]
         numbers = {"seed": self.seed, "return": self.returns, **{name: getattr(self, name) for name in rest}}
-        return pl.DataFrame({**where, **numbers, **self.outcomes})
+        drawn = {f"drawn_{name}": values for name, values in self.drawn.items()}
+        return pl.DataFrame({**where, **numbers, **self.outcomes, **drawn})
 
 
 def chosen_scenario(environment: Environment, scenario: Scenario | str | Path | None) -> Scenario:
@@ -126,7 +130,7 @@ def evaluate(
 
     Returns:
         A tidy data frame with one row per policy and episode: environment, scenario, observe, policy, seed, return, and
-        the columns of `Episodes`.
+        the columns of `Episodes`; those of `drawn` with this word and an underscore before them.
 
     Raises:
         TypeError: if `env` is no environment of khop_env, or a policy lacks `reset` or `act`.
@@ -211,7 +215,7 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int, recorde
     if recorder is not None:
         recorder.begin(seeds[:count], observations)
     error[0] = infos["task_error"].mean(axis=1)
-    outcomes = Outcomes(env, infos)
+    outcomes, drawn = Outcomes(env, infos), _drawn(env)
     running, length = np.ones(env.num_envs, bool), np.full(env.num_envs, horizon)
     for cycle in range(1, horizon + 1):
         actions = _by_agent(env, policy.act(by_agent(env, observations)))
@@ -258,7 +262,17 @@ def _play(env: BatchedEnv, policy: Policy, seeds: list[int], count: int, recorde
         **{key: values[..., :count] for key, values in whole.items()},
         time=period * np.arange(horizon + 1.0),
         outcomes={key: values[:count] for key, values in outcomes.result().items()},
+        drawn={key: values[:count] for key, values in drawn.items()},
     )
+
+
+def _drawn(env: BatchedEnv) -> dict[str, FloatArray]:
+    """What the present episodes drew from the ranges of their network, (B,) each, by name."""
+    observers = env.simulator.observers
+    if not isinstance(observers, Networked):
+        return {}
+    networks = observers.drawn(env.simulator.state)
+    return {name: np.array([getattr(each, name) for each in networks]) for name in observers.network.ranges}
 
 
 def require_seeds(seeds: Sequence[int]) -> None:

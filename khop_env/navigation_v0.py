@@ -184,7 +184,7 @@ values are clipped and counted in the infos
 `threads`: that share the environments of a batch (default 1), or "auto"; the same results with any number
 
 `network`: how messages are exchanged: a profile ("ideal", "urllc", "factory", "wifi", "lossy", "saturation", "espnow",
-"crazyradio"), also with other values ("lossy:period=0.1,loss=0.1..0.3,burst=5"), a `khop_env.network.Network` or a
+"crazyradio", "random"), also with other values ("lossy:period=0.1,loss=0.1..0.3"), a `khop_env.network.Network` or a
 mapping of its values. By default the scenario's own: 30 % lost in bursts of 5
 
 `estimator`: from messages to estimates under a network: "ppso" for the paper's observers, "relay" for stamped states

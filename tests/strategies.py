@@ -34,12 +34,16 @@ from khop_env.simulation import InitialSet, Simulator, View
 SEEDS = st.integers(0, 2**32 - 1)
 NETWORKS = st.builds(
     lambda loss, burst, latency, jitter, period: Network(
-        period, loss, None if burst is None else max(burst, loss[1] / (1.0 - loss[1])), latency, min(jitter, latency[0])
+        period,
+        loss,
+        None if burst is None else tuple(max(each, loss[1] / (1.0 - loss[1])) for each in burst),
+        latency,
+        tuple(min(each, latency[0]) for each in jitter),
     ),
     loss=st.tuples(st.floats(0, 0.45), st.floats(0.45, 0.9)),
-    burst=st.sampled_from([None, 1.0, 5.0, 20.0]),
+    burst=st.sampled_from([None, (1.0, 1.0), (1.0, 5.0), (5.0, 20.0)]),
     latency=st.tuples(st.floats(0, 0.2), st.floats(0.2, 0.4)),
-    jitter=st.floats(0, 0.2),
+    jitter=st.tuples(st.floats(0, 0.1), st.floats(0.1, 0.2)),
     period=st.sampled_from([0.005, 0.05, 0.1]),
 )
 PLANAR = (

@@ -201,7 +201,7 @@ def collected_of(
     collected = collect(
         scenario,
         supervisor.folder,
-        over.network,
+        over.network.drawn(setup.network_key),
         setup.estimator,
         steps=setup.steps,
         last_step=last,

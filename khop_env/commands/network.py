@@ -42,7 +42,7 @@ def network(
         str | None,
         typer.Option(
             help="Profiles, with other values after a colon: ideal,wifi,lossy:loss=0.3,burst=5 are three; by default "
-            "all profiles."
+            "all profiles that are the same in every episode."
         ),
     ] = None,
     estimators: Annotated[
@@ -147,7 +147,7 @@ def _parts(
 def _profiles() -> list[str]:
     from khop_env.network import PROFILES
 
-    return list(PROFILES)
+    return [name for name, network in PROFILES.items() if not network.ranges]
 
 
 def _numbers(text: str) -> list[float]:

@@ -83,7 +83,7 @@ def collect(
     Args:
         scenario: that was run.
         folder: of the records.
-        network: over which messages went.
+        network: over which messages went, as drawn.
         estimator: its name.
         steps: of the plant per round.
         last_step: with which the run ended.
@@ -177,8 +177,7 @@ def _collected(
     most = max(2, MOST_ROWS // max(1, layout.size))
     stride = max(1, math.ceil(1.0 / (h * _SAMPLES) - 1e-9), math.ceil((count - 1) / (most - 1)))
     chosen: IntArray = np.unique(np.append(np.arange(0, count, stride), count - 1))
-    on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
-    missed = np.maximum((np.arange(count) // steps)[:, None] - newest - on_time, 0.0)
+    missed = np.maximum((np.arange(count) // steps)[:, None] - newest - network.most_rounds_late, 0.0)
     missed[newest < 0] = math.inf
     nothing = np.zeros(1)
     record = MessageRecord(

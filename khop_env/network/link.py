@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from khop_env.network.network import Network
-from khop_env.network.randomness import DELAY, EPISODE, EPISODE_ROUND, LOSS, NOISE, plain_uniform
+from khop_env.network.randomness import DELAY, EPISODE_ROUND, LOSS, NOISE, plain_uniform
 
 
 class PlainLink:
@@ -15,16 +15,16 @@ class PlainLink:
         number: of the link, in the order of `physics.Links`.
 
     Attributes:
+        network: of this episode, without ranges.
         round: the last round, -1 before the first.
         newest: round in which the newest message that has arrived was sent, -1 for none yet.
     """
 
     def __init__(self, network: Network, key: int, number: int) -> None:
-        self.network, self.key, self.number = network, key, number
-        low, high = network.bounds("loss")
-        self._loss = low + (high - low) * plain_uniform(key, EPISODE_ROUND, 0, EPISODE)
-        low, high = network.bounds("latency")
-        self._latency = low + (high - low) * plain_uniform(key, EPISODE_ROUND, 1, EPISODE)
+        self.network, self.key, self.number = network.drawn(key), key, number
+        self._loss, self._latency = self.network.bounds("loss")[0], self.network.bounds("latency")[0]
+        self._jitter = self.network.bounds("jitter")[0]
+        self._recovery = None if network.burst is None else 1.0 / self.network.bounds("burst")[0]
         self._bad = plain_uniform(key, EPISODE_ROUND, number, LOSS) < self._loss
         self._flying: list[tuple[int, int]] = []  # (round of arrival, round of sending)
         self.round = self.newest = -1
@@ -46,15 +46,13 @@ class PlainLink:
         return self.round + self._rounds_late() if up and not self._bad else None
 
     def _probability_of_loss(self) -> float:
-        if self.network.burst is None:
+        if self._recovery is None:
             return self._loss
-        recovery = 1.0 / self.network.burst
-        return 1.0 - recovery if self._bad else recovery * self._loss / (1.0 - self._loss)
+        return 1.0 - self._recovery if self._bad else self._recovery * self._loss / (1.0 - self._loss)
 
     def _rounds_late(self) -> int:
-        jitter = self.network.jitter
         u = plain_uniform(self.key, self.round, self.number, DELAY)
-        delay = self._latency - jitter + 2.0 * jitter * u
+        delay = self._latency - self._jitter + 2.0 * self._jitter * u
         return min(self.network.most_rounds_late, self.network.rounds_late(delay))
 
 

@@ -1,16 +1,20 @@
-"""A communication network as four or five numbers: how often agents send, and what becomes of their messages."""
+"""A communication network as six numbers or ranges: how often agents send, and what becomes of their messages."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
+from khop_env.network.randomness import EPISODE, EPISODE_ROUND, plain_uniform
 from khop_env.network.reading import Span, number, number_or_range, parsed
 from khop_env.physics import did_you_mean
 
 MOST_ROUNDS_LATE = 4096
 
+DRAWN = ("loss", "latency", "burst", "jitter")
+"""What may be a range: an episode's random numbers in this order."""
 
 NO_NETWORK = "none"
 """Name of exchange in continuous time, where None stands for "as the scenario has it"."""
@@ -23,7 +27,8 @@ class Network:
     Losses follow the Gilbert-Elliott model: a link in its good state delivers, in its bad state loses; from one message
     to the next good turns bad with probability loss / (burst (1 - loss)), and bad turns good with 1 / burst.
 
-    `loss` and `latency` may be ranges (low, high), from which each episode draws one value for all its links.
+    `loss`, `burst`, `latency` and `jitter` may be ranges (low, high). From each of them every episode draws one value,
+    uniformly, for all its links. Every combination of values has to be a network.
 
     Source: E. N. Gilbert, Capacity of a burst-noise channel, Bell System Technical Journal 39, 1960.
 
@@ -42,42 +47,46 @@ class Network:
 
     period: float = 0.05
     loss: Span = 0.0
-    burst: float | None = None
+    burst: Span | None = None
     latency: Span = 0.0
-    jitter: float = 0.0
+    jitter: Span = 0.0
     noise: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("period", "jitter", "noise", *(["burst"] if self.burst is not None else [])):
+        for name in ("period", "noise"):
             object.__setattr__(self, name, number(getattr(self, name), f"Network.{name}"))
-        for name in ("loss", "latency"):
-            object.__setattr__(self, name, number_or_range(getattr(self, name), f"Network.{name}"))
+        for name in DRAWN:
+            if name != "burst" or self.burst is not None:
+                object.__setattr__(self, name, number_or_range(getattr(self, name), f"Network.{name}"))
         if not 0.0 < self.period < math.inf:
             raise ValueError(f"Network.period must be positive and finite, in s; got {self.period!r}")
         low, high = self.bounds("loss")
         if not 0.0 <= low <= high <= 1.0:
             raise ValueError(f"Network.loss must be from 0 to 1 (30 % are 0.3); got {self.loss!r}")
         if self.burst is not None:
-            if not 1.0 <= self.burst < math.inf:
+            short, long = self.bounds("burst")
+            if not 1.0 <= short <= long < math.inf:
                 raise ValueError(f"Network.burst must be a mean number of messages, at least 1; got {self.burst!r}")
-            if high > self.burst / (1.0 + self.burst) * (1.0 + 1e-9):
+            if high > short / (1.0 + short) * (1.0 + 1e-9):
                 shortest = f"{math.ceil(1e3 * high / (1.0 - high) - 1e-6) / 1e3:g} or more" if high < 1.0 else "None"
+                drawn = {"loss", "burst"} & set(self.ranges)
+                every = " (every value of a range has to fit all others)" if drawn else ""
                 raise ValueError(
-                    f"Network.burst = {self.burst:g} is too short for a loss of {high:g}, even with one message "
-                    f"delivered between bursts: take {shortest}"
+                    f"Network.burst = {short:g} is too short for a loss of {high:g}, even with one message "
+                    f"delivered between bursts: take {shortest}{every}"
                 )
-        low, high = self.bounds("latency")
-        for name in ("jitter", "noise"):
-            if not 0.0 <= getattr(self, name) < math.inf:
+        (low, high), (least, most) = self.bounds("latency"), self.bounds("jitter")
+        for name, ends in (("jitter", (least, most)), ("noise", (self.noise,))):
+            if not all(0.0 <= each < math.inf for each in ends):
                 raise ValueError(f"Network.{name} must be finite and not negative; got {getattr(self, name)!r}")
-        if not self.jitter <= low <= high < math.inf:
+        if not most <= low <= high < math.inf:
             raise ValueError(
-                f"Network.latency must be finite and at least the jitter of {self.jitter:g} s, or messages would come "
+                f"Network.latency must be finite and at least the jitter of {most:g} s, or messages would come "
                 f"before they are sent; got {self.latency!r}"
             )
-        if self.rounds_late(high + self.jitter) > MOST_ROUNDS_LATE:
+        if self.rounds_late(high + most) > MOST_ROUNDS_LATE:
             raise ValueError(
-                f"Network.latency and jitter delay messages by up to {high + self.jitter:g} s, which are more than "
+                f"Network.latency and jitter delay messages by up to {high + most:g} s, which are more than "
                 f"{MOST_ROUNDS_LATE} periods of {self.period:g} s; take a longer period"
             )
 
@@ -87,6 +96,7 @@ class Network:
 
             Network.of("wifi")
             Network.of("lossy:period=0.1,loss=0.1..0.3,burst=5")    # a profile with other numbers; a range
+            Network.of("random:loss=0..0.7,burst=3..8")             # of this profile everything is drawn
             Network.of({"profile": "lossy", "loss": [0.1, 0.3]})    # a table of a scenario file
             Network.of("none")                                      # no messages: exchange in continuous time
 
@@ -119,9 +129,26 @@ class Network:
         return _changed(name.strip(), values)
 
     def bounds(self, name: str) -> tuple[float, float]:
-        """Lowest and highest value of `name`, "loss" or "latency"."""
+        """Lowest and highest value of `name`, "loss", "burst" (unless it is None), "latency" or "jitter"."""
         value = getattr(self, name)
         return value if isinstance(value, tuple) else (value, value)
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """What is drawn in each episode, by name: lowest and highest value."""
+        return {name: self.bounds(name) for name in DRAWN if isinstance(getattr(self, name), tuple)}
+
+    def drawn(self, key: int) -> Network:
+        """The network of one episode: in place of each range the value that is drawn from it.
+
+        Args:
+            key: 64-bit key of the episode's randomness, as in the memory of `Channel`.
+        """
+        found: dict[str, Any] = {}
+        for name, (low, high) in self.ranges.items():
+            u = plain_uniform(key, EPISODE_ROUND, DRAWN.index(name), EPISODE)
+            found[name] = min(high, low + (high - low) * u)
+        return replace(self, **found) if found else self
 
     def rounds_late(self, delay: float) -> int:
         """Rounds from sending until a message that takes `delay` seconds can be used: rounded up, to 1e-9 of one."""
@@ -130,22 +157,23 @@ class Network:
     @property
     def most_rounds_late(self) -> int:
         """Rounds until the latest message can be used."""
-        return self.rounds_late(self.bounds("latency")[1] + self.jitter)
+        return self.rounds_late(self.bounds("latency")[1] + self.bounds("jitter")[1])
 
     @property
     def fewest_rounds_late(self) -> int:
         """Rounds until the earliest message can be used."""
-        return self.rounds_late(self.bounds("latency")[0] - self.jitter)
+        return self.rounds_late(self.bounds("latency")[0] - self.bounds("jitter")[1])
 
     def described(self) -> str:
         """One line: "a message every 50 ms, 30 % lost in bursts of 5, 30 +- 5 ms late"."""
         low, high = (100.0 * value for value in self.bounds("loss"))
         parts = [f"a message every {1e3 * self.period:g} ms", f"{_span(low, high)} % lost" if high else "none lost"]
         if high and self.burst is not None:
-            parts[-1] += f" in bursts of {self.burst:g}"
+            parts[-1] += f" in bursts of {_span(*self.bounds('burst'))}"
         low, high = (1e3 * value for value in self.bounds("latency"))
         if high:
-            parts.append(f"{_span(low, high)}{f' +- {1e3 * self.jitter:g}' if self.jitter else ''} ms late")
+            least, most = (1e3 * value for value in self.bounds("jitter"))
+            parts.append(f"{_span(low, high)}{f' +- {_span(least, most)}' if most else ''} ms late")
         if self.noise:
             parts.append(f"noise up to {self.noise:g}")
         return ", ".join(parts)
@@ -180,5 +208,7 @@ PROFILES: dict[str, Network] = {
     "espnow": Network(latency=0.040, loss=0.08),
     # A crowded Crazyradio channel without acknowledgements; figures of ours.
     "crazyradio": Network(latency=0.026, loss=0.3),
+    # For trainings: each episode draws a network, from nearly perfect to worse than most of the above.
+    "random": Network(loss=(0.0, 0.5), burst=(1.0, 8.0), latency=(0.01, 0.1), jitter=(0.0, 0.005)),
 }
-"""Networks by name; `khop network` lists them."""
+"""Networks by name; `khop network` measures those that are the same in every episode."""

@@ -21,30 +21,33 @@ FEW_SLOTS = 4  # of the ring: up to so many one loop each, which vectorises, cos
 
 
 class Rules(NamedTuple):
-    """A network as compiled loops take it: every value that is drawn is low + span * uniform, of each episode."""
+    """A network as compiled loops take it: of all that episodes draw the lowest and the highest value."""
 
-    loss_low: float
-    loss_span: float
-    recovery: float  # 1 / burst; 0 for independent losses
-    latency_low: float
-    latency_span: float
-    jitter: float
+    loss: tuple[float, float]
+    latency: tuple[float, float]
+    burst: tuple[float, float]  # 0 for independent losses
+    jitter: tuple[float, float]
     period: float
     most_rounds_late: int
 
     @staticmethod
     def of(network: Network) -> Rules:
         """The rules of a network."""
-        loss, latency = network.bounds("loss"), network.bounds("latency")
-        recovery = 0.0 if network.burst is None else 1.0 / network.burst
-        late = network.most_rounds_late
-        spans = loss[1] - loss[0], latency[1] - latency[0]
-        return Rules(loss[0], spans[0], recovery, latency[0], spans[1], network.jitter, network.period, late)
+        burst = (0.0, 0.0) if network.burst is None else network.bounds("burst")
+        loss, latency, jitter = (network.bounds(name) for name in ("loss", "latency", "jitter"))
+        return Rules(loss, latency, burst, jitter, network.period, network.most_rounds_late)
 
 
 @inlined
-def _rounds_late(rules: Rules, latency: float, u: float) -> int:
-    delay = latency - rules.jitter + 2.0 * rules.jitter * u
+def _drawn(span: tuple[float, float], base: np.uint64, number: int) -> float:
+    """What `Network.drawn` draws: `number` is that of `DRAWN`."""
+    low, high = span
+    return low if low == high else min(high, low + (high - low) * uniform(base, number, EPISODE))
+
+
+@inlined
+def _rounds_late(rules: Rules, latency: float, jitter: float, u: float) -> int:
+    delay = latency - jitter + 2.0 * jitter * u
     return min(rules.most_rounds_late, math.ceil(delay / rules.period - 1e-9))
 
 
@@ -53,7 +56,7 @@ def start_links(rules: Rules, key: NDArray[np.uint64], env_ids: IndexArray, bad:
     """Draw the links' first states from their stationary distribution."""
     for b in env_ids:
         base = round_key(key[b], EPISODE_ROUND)
-        loss = rules.loss_low + rules.loss_span * uniform(base, 0, EPISODE)
+        loss = _drawn(rules.loss, base, 0)
         for link in range(bad.shape[0]):
             bad[link, b] = uniform(base, link, LOSS) < loss
 
@@ -76,20 +79,23 @@ def run_round(
     links, width = newest.shape[0], high - low
     bits = WORD * lost.shape[0]
     of_round = np.empty(width, np.uint64)
-    after_delivery, after_loss, latency = np.empty(width), np.empty(width), np.empty(width)
+    after_delivery, after_loss = np.empty(width), np.empty(width)
+    latency, jitter = np.empty(width), np.empty(width)
     soonest, latest = np.empty(width, np.int64), np.empty(width, np.int64)
     for e in range(width):
         b = place(low + e)
         if due[b]:
             number[b] += 1
         base = round_key(key[b], EPISODE_ROUND)
-        loss = rules.loss_low + rules.loss_span * uniform(base, 0, EPISODE)
-        latency[e] = rules.latency_low + rules.latency_span * uniform(base, 1, EPISODE)
+        loss, latency[e] = _drawn(rules.loss, base, 0), _drawn(rules.latency, base, 1)
+        burst, jitter[e] = _drawn(rules.burst, base, 2), _drawn(rules.jitter, base, 3)
         after_delivery[e] = after_loss[e] = loss
-        if rules.recovery > 0.0:
-            after_delivery[e], after_loss[e] = rules.recovery * loss / (1.0 - loss), 1.0 - rules.recovery
+        if burst > 0.0:
+            recovery = 1.0 / burst
+            after_delivery[e], after_loss[e] = recovery * loss / (1.0 - loss), 1.0 - recovery
         of_round[e] = round_key(key[b], number[b])
-        soonest[e], latest[e] = _rounds_late(rules, latency[e], 0.0), _rounds_late(rules, latency[e], 1.0)
+        soonest[e] = _rounds_late(rules, latency[e], jitter[e], 0.0)
+        latest[e] = _rounds_late(rules, latency[e], jitter[e], 1.0)
     for link in range(links):
         for e in range(width):
             b = place(low + e)
@@ -110,7 +116,7 @@ def run_round(
                     continue
                 if latest[e] > soonest[e]:
                     u = uniform(round_key(key[b], sent), link, DELAY)
-                    if _rounds_late(rules, latency[e], u) > age:
+                    if _rounds_late(rules, latency[e], jitter[e], u) > age:
                         continue
                 newest[link, b], heard[link, b] = sent, True
                 break

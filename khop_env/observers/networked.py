@@ -108,7 +108,9 @@ class Networked:
         self._exchange = Exchange(self.channel, self.estimator, sources, fleet.n, self.pool)
         self._activity = None if design.schedule is None else design.activity()
         self._up = np.ones((len(design.links), num_envs), np.bool_)
-        self._fastest = self._fewest_rounds()
+        hops = hops_from_targets(design.communication, design.k)
+        pairs = zip(layout.pair_target.tolist(), layout.observer.tolist(), strict=True)
+        self._distance = np.array([hops[a][i] for i, a in pairs], float)
         self._plan_steps()
 
     def allocate(self) -> Memory:
@@ -180,6 +182,10 @@ class Networked:
             return None
         return self._activity.up(state.memory[CHANNEL + "key"], state.t, state.x, self._up)
 
+    def drawn(self, state: PlantState) -> list[Network]:
+        """The network of each environment's episode: `network` with what was drawn in place of ranges."""
+        return [self.network.drawn(key) for key in state.memory[CHANNEL + "key"].tolist()]
+
     def information(self, state: PlantState) -> Information:
         """Age, way and time of arrival of the newest state that each pair has received."""
         stamp, arrived = state.memory["stamp"], state.memory["arrived"]
@@ -190,14 +196,15 @@ class Networked:
     def limits(self, state: PlantState, out: FloatArray) -> FloatArray:
         """The information limit: certified radii at the age that a state has at least, were no message lost.
 
-        It is what no estimator can do better than, with this network's period and smallest latency.
+        It is what no estimator can do better than, with this network's period and each episode's smallest latency.
 
         Returns:
             `out` (P, B), written.
         """
         h, period = float(state.memory["step"].max()) or self.longest_step, self.network.period
         round_ = state.memory[CHANNEL + "round"]
-        rounds = self._fastest[:, None]
+        late = np.array([network.fewest_rounds_late for network in self.drawn(state)], float)
+        rounds = np.where(late > 0.0, self._distance[:, None] * late, self._distance[:, None] - 1.0)
         since = np.maximum(state.t - round_ * period, 0.0)
         grid = np.floor((since + rounds * period) / h + 1e-6).astype(np.int64)
         source = self.layout.column_source
@@ -302,16 +309,6 @@ class Networked:
             *part,
         )
 
-    def _fewest_rounds(self) -> FloatArray:
-        """(pairs,) rounds that a state is old at least when it arrives, by distance and smallest latency."""
-        hops = hops_from_targets(self.design.communication, self.design.k)
-        distance = np.array(
-            [hops[a][i] for i, a in zip(self.layout.pair_target.tolist(), self.layout.observer.tolist(), strict=True)],
-            float,
-        )
-        late = self.network.fewest_rounds_late
-        return distance * late if late else distance - 1.0
-
 
 def missed_rounds(observers: Observers, state: PlantState) -> FloatArray:
     """(L, B) rounds by which the newest message over each link is older than one that comes on time.
@@ -320,7 +317,7 @@ def missed_rounds(observers: Observers, state: PlantState) -> FloatArray:
     """
     if not isinstance(observers, Networked):
         return np.zeros((len(observers.layout.links), len(state.t)))
-    network, newest = observers.network, state.memory[CHANNEL + "newest"]
-    on_time = network.rounds_late(network.bounds("latency")[0] + network.jitter)
+    newest = state.memory[CHANNEL + "newest"]
+    on_time = [network.most_rounds_late for network in observers.drawn(state)]
     missed = state.memory[CHANNEL + "round"] - newest - on_time
     return np.where(newest < 0, math.inf, np.maximum(missed, 0))

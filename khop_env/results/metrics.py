@@ -70,10 +70,11 @@ def summarize(
 
     Over a network of messages the certified bounds are what is guaranteed, and the disagreements are those that the
     estimator's agents compute from what they hold, null where it has none. `funnel_kept` is about
-    these only, and null, too, where there are none. There are further keys: `network` and `estimator`; `bounds_kept`,
-    which is True if errors kept their certified bounds and the run reached its end with finite states; `violations`,
-    how many of the `pair_samples` (pairs and samples) have an error above the certified bound; `mean_age`, of the
-    states that have arrived, in s; and `uncertified`, by agent why it has no bound.
+    these only, and null, too, where there are none. There are further keys: `network` and `estimator`; `drawn`, if the
+    network has ranges, with what this run drew from them; `bounds_kept`, which is True if errors kept their certified
+    bounds and the run reached its end with finite states; `violations`, how many of the `pair_samples` (pairs and
+    samples) have an error above the certified bound; `mean_age`, of the states that have arrived, in s; and
+    `uncertified`, by agent why it has no bound.
 
     Args:
         recording: recording of the run.
@@ -140,8 +141,10 @@ def _of_network(observers: Observers, fleet: Fleet, states: MessageRecord, kept:
     """What a network adds to a summary."""
     assert isinstance(observers, Networked)
     arrived = states.age[np.isfinite(states.age)]
+    ranges = observers.network.ranges
     return {
         "network": observers.network.described(),
+        **({"drawn": {name: getattr(states.network, name) for name in ranges}} if ranges else {}),
         "estimator": observers.estimator.name,
         "bounds_kept": kept,
         "violations": violations(np.abs(states.error).T, states.bound.T, states.truth.T, states.layout),

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from khop_env.network import Network
-from khop_env.observers import Certificate
+from khop_env.observers import Certificate, FloatArray
 from khop_env.physics import hops_from_targets
 from khop_env.results.metrics import finite
 from khop_env.scenarios import Scenario
+
+_ACROSS = 1000  # values of a range, of which means are taken
 
 
 def network_report(scenario: Scenario, network: Network) -> dict[str, Any]:
@@ -67,13 +69,21 @@ def expected_age(network: Network, hops: int) -> float:
     """Mean age of the newest known state of an agent `hops` links away, in s, were there only one path to it.
 
     A round passes half on average; then the delay of each link in whole rounds, one round for each message that is
-    passed on without delay; and on each link the mean number of losses in a row until now, loss times burst.
+    passed on without delay; and on each link the mean number of losses in a row until now, loss times burst. Of ranges
+    it is the mean over what episodes draw.
     """
-    loss, latency = (sum(network.bounds(name)) / 2.0 for name in ("loss", "latency"))
-    burst = network.burst or (1.0 / (1.0 - loss) if loss < 1.0 else np.inf)
-    late = network.rounds_late(latency)
-    fastest = hops * late if late else hops - 1
-    return network.period * (0.5 + fastest + (hops * loss * burst if loss else 0.0))
+    loss, late = _across(network.bounds("loss")), [network.rounds_late(x) for x in _across(network.bounds("latency"))]
+    fastest = np.mean([hops * rounds if rounds else hops - 1 for rounds in late])
+    with np.errstate(divide="ignore"):
+        burst = 1.0 / (1.0 - loss) if network.burst is None else np.mean(network.bounds("burst"))
+    return network.period * float(0.5 + fastest + np.mean(hops * loss * burst))
+
+
+def _across(span: tuple[float, float]) -> FloatArray:
+    """Values that are spread evenly over a range; one if its ends are equal."""
+    low, high = span
+    count = _ACROSS if low < high else 1
+    return low + (high - low) * (np.arange(count) + 0.5) / count
 
 
 def _ideal_bounds(scenario: Scenario) -> dict[tuple[int, int], float]:

@@ -141,7 +141,10 @@ def measure_networks(
 
 def sweeps(network: Network) -> tuple[list[Network], list[Network]]:
     """A network at `SWEPT_PERIODS`, and one at those of `SWEPT_LOSSES` that its bursts allow, for `network_figure`."""
-    longest = 1.0 if network.burst is None else network.burst / (1.0 + network.burst)
+    longest = 1.0
+    if network.burst is not None:
+        shortest = network.bounds("burst")[0]
+        longest = shortest / (1.0 + shortest)
     return [replace(network, period=period) for period in SWEPT_PERIODS], [
         replace(network, loss=loss) for loss in SWEPT_LOSSES if loss <= longest
     ]

@@ -238,7 +238,7 @@ class Samples:
             observers = self._simulator.observers
             network, estimator = None, observers.name
             if isinstance(observers, Networked):
-                network, estimator = observers.network, observers.estimator.name
+                network, estimator = observers.drawn(self._simulator.state)[0], observers.estimator.name
             states = MessageRecord(
                 layout=observers.layout,
                 time=time,

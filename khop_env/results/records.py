@@ -100,7 +100,7 @@ class MessageRecord:
         bound: (T, P) certified bounds on their errors; inf where nothing is certified.
         age: (T, pairs) time since the newest state that has arrived was measured, in s; inf where none has.
         missed: (T, L) rounds by which the newest message over each link is older than one that comes on time.
-        network: over which messages are exchanged.
+        network: over which messages are exchanged, without ranges; None for observers of a user's own.
         estimator: its name.
         up: (T, L) whether each link was up; None where all were, always.
     """

@@ -16,9 +16,9 @@ from khop_env.scenarios.scenario import Scenario
 _COMMENTS = {
     "period": "s, between two messages of an agent",
     "loss": "mean share of lost messages; [low, high]: each episode draws one",
-    "burst": "mean number of messages lost in a row; left out: independent losses",
+    "burst": "mean number of messages lost in a row, or [low, high]; left out: independent losses",
     "latency": "s, from sending to delivery, mean; or [low, high]",
-    "jitter": "s, largest deviation from it",
+    "jitter": "s, largest deviation from it; or [low, high]",
     "noise": "largest measurement error of a state that is sent, in the state's unit",
 }
 

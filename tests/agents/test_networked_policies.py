@@ -8,7 +8,7 @@ import pytest
 from agents import LAWS, describe, make_policy
 from agents.learning import PRETRAINED, LearnedPolicy, PolicyFileError, TrainingConfig
 from agents.learning.config_file import read_config, write_config
-from agents.learning.environment import training_environment
+from agents.learning.environment import build, training_environment
 from agents.learning.learned import columns_of
 from agents.learning.scaling import ObservationScaler
 from agents.policy import by_agent
@@ -119,6 +119,26 @@ def test_training_settings_name_a_network():
         config = TrainingConfig("consensus_v0", num_envs=2, arguments={"network": network, "estimator": "relay"})
         env = training_environment(config).venv.venv.batched
         assert env.settings.network == Network.of(network)
+
+
+def test_copies_and_episodes_of_a_training_draw_their_own_networks():
+    """And the episodes that select the best policy are played over networks out of the same ranges."""
+    text = "random:loss=0..0.6,burst=2..8"
+    arguments = {"network": text, "estimator": "relay", "max_cycles": 6}
+    config = TrainingConfig("consensus_v0", num_envs=3, arguments=arguments)
+    env = training_environment(config)
+    env.reset()
+    seen, batched = [], env.venv.batched
+    for _ in range(18):
+        seen.append(batched.simulator.observers.drawn(batched.simulator.state))
+        env.step(np.zeros((len(batched.agents) * 3, *env.action_space.shape), np.float32))
+    for copy, networks in enumerate(zip(*seen, strict=True)):
+        episodes = list(dict.fromkeys(networks))
+        assert [networks.count(each) for each in episodes] == [6 - 2 * copy, 6, 6, 2 * copy][: 3 + (copy > 0)]
+    networks = {each for row in seen for each in row}
+    assert len(networks) == 3 + 4 + 4
+    assert all(0.0 <= each.loss <= 0.6 and 2.0 <= each.burst <= 8.0 for each in networks)
+    assert build(config, 2).settings.network == Network.of(text)
 
 
 def test_training_settings_are_read_back(tmp_path):

@@ -9,6 +9,7 @@ from scipy.stats import binomtest
 from typer.testing import CliRunner
 
 from agents import compare, describe, interval95, make_policy, play
+from agents.comparison import CHUNK
 from agents.outcomes import summary, wilson95
 from agents.policy import policy_seeds
 from agents.running import PolicyRun, policy_run
@@ -122,6 +123,26 @@ def test_several_networks_in_one_table():
         assert "network" not in alone.frame().columns
     with pytest.raises(ValueError, match="networks must be names, and arguments without a network then"):
         compare("consensus_v0", ["tanh"], networks=networks, arguments={"network": "wifi"})
+
+
+def test_what_episodes_drew_is_in_the_frame():
+    """By seed, whatever plays; null where the network has no range of it."""
+    networks, seeds = ["ideal", "random", "wifi:loss=0..0.3"], range(CHUNK + 3)
+    arguments = {"max_cycles": 2}
+    table = compare("consensus_v0", ["tanh", "zero"], networks=networks, seeds=seeds, arguments=arguments).frame()
+    names = [name for name in table.columns if name.startswith("drawn_")]
+    assert names == ["drawn_loss", "drawn_latency", "drawn_burst", "drawn_jitter"]
+    for network, drawn in (("ideal", []), ("random", names), ("wifi:loss=0..0.3", names[:1])):
+        tanh, zero = (table.filter(network=network, policy=policy).select(names) for policy in ("tanh", "zero"))
+        assert tanh.equals(zero)
+        assert [name for name in names if not tanh[name].null_count()] == drawn
+        env = make_batched("consensus_v0", network=network, num_envs=len(seeds))
+        env.reset(seed=list(seeds))
+        for name in drawn:
+            values = [getattr(each, name[6:]) for each in env.simulator.observers.drawn(env.simulator.state)]
+            assert tanh[name].to_list() == values
+            assert len(set(values)) == len(seeds)
+    assert not any("drawn" in name for name in compare("consensus_v0", ["zero"], seeds=[0]).frame().columns)
 
 
 def test_rows_name_their_network_wherever_it_comes_from():

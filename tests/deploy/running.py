@@ -161,7 +161,7 @@ class Team:
         return collect(
             self.chosen,
             self.folder,
-            self.simulator.observers.network,
+            self.simulator.observers.network.drawn(setup.network_key),
             setup.estimator,
             steps=self.steps,
             last_step=self.step,

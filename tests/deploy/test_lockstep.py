@@ -18,9 +18,9 @@ def network_of(seed: int) -> Network:
     return Network(
         period=0.04,
         loss=float(rng.uniform(0.05, 0.4)),
-        burst=3.0 if rng.random() < 0.5 else None,
+        burst=(2.0, 4.0) if rng.random() < 0.5 else None,
         latency=(jitter, jitter + 0.05),
-        jitter=jitter,
+        jitter=(jitter / 2.0, jitter),
         noise=0.01 if rng.random() < 0.5 else 0.0,
     )
 

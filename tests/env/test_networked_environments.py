@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from khop_env.network import Network
+from khop_env.observers.networked import missed_rounds
 from tests.env.playing import (
     batched,
     parallel,
@@ -20,6 +21,7 @@ from tests.env.playing import (
 CASES = [*itertools.product(("paper", "mixed_fleet"), ("ppso", "relay")), ("convoy", "relay")]
 cases = pytest.mark.parametrize(("name", "estimator"), CASES)
 BURSTS = "lossy:loss=0.5,burst=4"
+DRAWN = "random:loss=0.1..0.7,burst=3..20"
 SILENT = Network(loss=1.0)
 
 
@@ -155,7 +157,7 @@ def test_exchange_without_a_network_has_no_ages():
 @pytest.mark.parametrize(
     ("environment", "name", "arguments", "checks"),
     [
-        ("consensus_v0", "paper", {"network": BURSTS, "bounds": True}, ()),
+        ("consensus_v0", "paper", {"network": DRAWN, "bounds": True}, ()),
         ("leader_following_v0", "convoy", {"network": "lossy:noise=0.01", "observe": "local", "bounds": True}, ()),
         (
             "formation_v0",
@@ -170,17 +172,28 @@ def test_the_public_checks_pass(environment, name, arguments, checks):
     require_contract(partial(parallel, environment, name, max_cycles=8, **arguments), *checks, steps=10)
 
 
+def drawn(env):
+    """The networks of an environment's episodes."""
+    return env.simulator.observers.drawn(env.simulator.state)
+
+
+def limits_and_missed(env):
+    """The information limit of each estimate, and rounds missed on each link."""
+    observers, state = env.simulator.observers, env.simulator.state
+    return observers.limits(state, np.empty((observers.layout.size, env.num_envs))), missed_rounds(observers, state)
+
+
 def test_partial_resets_start_a_new_network():
     """The environments that go on keep every bit; those that begin anew have those of their own seed."""
-    env = batched("consensus_v0", num_envs=3, network="lossy:loss=0.1..0.9,burst=20", bounds=True)
-    twin = batched("consensus_v0", num_envs=3, network="lossy:loss=0.1..0.9,burst=20", bounds=True)
+    env = batched("consensus_v0", num_envs=3, network=DRAWN, bounds=True)
+    twin = batched("consensus_v0", num_envs=3, network=DRAWN, bounds=True)
     assert same(env.reset(seed=5), twin.reset(seed=5))
     rng = np.random.default_rng(0)
     for _ in range(5):
         actions = rng.uniform(-1.0, 1.0, (3, 8, 2))
         assert same(env.step(actions), twin.step(actions))
     observations, _ = env.reset(seed=[40], env_ids=[1])
-    alone = batched("consensus_v0", network="lossy:loss=0.1..0.9,burst=20", bounds=True)
+    alone = batched("consensus_v0", network=DRAWN, bounds=True)
     np.testing.assert_array_equal(observations[1], alone.reset(seed=40)[0][0])
     for _ in range(5):
         actions = rng.uniform(-1.0, 1.0, (3, 8, 2))
@@ -188,13 +201,41 @@ def test_partial_resets_start_a_new_network():
         np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
         np.testing.assert_array_equal(found[1], alone.step(actions[1:2])[0][0])
         assert not np.array_equal(found[1], expected[1])
+    (first, other, last), before = drawn(env), drawn(twin)
+    assert (first, last) == (before[0], before[2])
+    assert [other] == drawn(alone) != [before[1]]
+    assert len({each.latency for each in (*before, other)}) == 4  # every episode has its own
+
+
+@pytest.mark.parametrize("estimator", ["ppso", "relay"])
+def test_an_episode_over_ranges_is_that_over_the_network_it_drew(estimator):
+    """Observations and bounds to the last bit; the next episode of the same generator draws another network."""
+    env = batched("consensus_v0", num_envs=2, network=DRAWN, estimator=estimator, bounds=True)
+    observations, _ = env.reset(seed=[5, 6])
+    fixed = [batched("consensus_v0", network=each, estimator=estimator, bounds=True) for each in drawn(env)]
+    for number, each in enumerate(fixed):
+        assert same(each.reset(seed=[5 + number])[0][0], observations[number])
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        actions = rng.uniform(-1.0, 1.0, (2, 8, 2))
+        observations = env.step(actions)[0]
+        for number, each in enumerate(fixed):
+            assert same(each.step(actions[number][None])[0][0], observations[number])
+    limits, missed = limits_and_missed(env)
+    for number, each in enumerate(fixed):
+        for values, expected in zip((limits, missed), limits_and_missed(each), strict=True):
+            np.testing.assert_array_equal(values[:, number], expected[:, 0])
+    before = drawn(env)
+    env.reset(env_ids=[1])
+    assert drawn(env)[0] == before[0]
+    assert drawn(env)[1] != before[1]
 
 
 @pytest.mark.parametrize("estimator", ["ppso", "relay"])
 def test_the_same_bits_alone_or_in_a_batch(estimator):
     """All of the observers' memory, of many environments at once, in other bursts of losses each."""
-    env = batched("consensus_v0", num_envs=37, network=BURSTS, estimator=estimator)
-    alone = [batched("consensus_v0", network=BURSTS, estimator=estimator) for _ in range(0, 37, 6)]
+    env = batched("consensus_v0", num_envs=37, network=DRAWN, estimator=estimator)
+    alone = [batched("consensus_v0", network=DRAWN, estimator=estimator) for _ in range(0, 37, 6)]
     env.reset(seed=3)
     for number, each in enumerate(alone):
         each.reset(seed=3 + 6 * number)
@@ -212,8 +253,8 @@ def test_the_same_bits_alone_or_in_a_batch(estimator):
 
 def test_errors_stay_within_certified_bounds():
     """Also for full inputs of alternating sign: "max_error_to_bound" is over the certified bound."""
-    for name, estimator in CASES:
-        env = batched("consensus_v0", name, num_envs=4, network=BURSTS, estimator=estimator)
+    for (name, estimator), network in itertools.product(CASES, (BURSTS, DRAWN)):
+        env = batched("consensus_v0", name, num_envs=4, network=network, estimator=estimator)
         env.reset(seed=1)
         largest = 0.0
         for number in range(20):

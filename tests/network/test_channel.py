@@ -54,9 +54,9 @@ def test_compiled_rounds_are_the_plain_ones(network: Network, seed: int) -> None
 @given(network=NETWORKS, seed=SEEDS)
 def test_ages_grow_by_one_or_fall_to_a_delay(network: Network, seed: int) -> None:
     channel, memory = started(network, [seed])
-    low, high = network.bounds("latency")
-    soonest, latest = network.rounds_late(low - network.jitter), network.most_rounds_late
-    assert soonest <= latest <= high / network.period + network.jitter / network.period + 1
+    drawn = network.drawn(int(memory["key"][0]))
+    soonest, latest = drawn.fewest_rounds_late, drawn.most_rounds_late
+    assert soonest <= latest <= (drawn.latency + drawn.jitter) / network.period + 1
     before = channel.age(memory)
     for number in range(60):
         channel.exchange(memory, np.zeros((0, 1)))
@@ -96,6 +96,48 @@ def test_loss_and_bursts_have_their_means(loss: float, burst: float | None) -> N
     lengths = lost[1:].sum() - (lost[0] & lost[1]).sum()
     assert abs(lengths / starts - mean) < 5.0 * np.sqrt(mean * (mean - 1.0) / starts) + 0.01 * mean
     assert abs(lost[0].mean() - loss) < 5.0 * np.sqrt(loss * (1.0 - loss) / lost[0].size)  # stationary from the start
+
+
+def test_every_episode_loses_and_delays_as_it_has_drawn() -> None:
+    """The profile "random" in 60 environments: shares of losses, lengths of bursts, and delays, of each by itself."""
+    network, rounds, envs = Network.of("random:loss=0.05..0.5,latency=0.05..0.15,jitter=0..0.05"), 4000, 60
+    channel, memory = started(network, list(range(envs)))
+    newest, bad = [], []
+    for _ in range(rounds):
+        channel.exchange(memory, np.zeros((0, envs)))
+        newest.append(memory["newest"].copy())
+        bad.append(memory["bad"].copy())
+    lost, newest = np.array(bad), np.array(newest)
+    age = np.arange(rounds)[:, None, None] - newest
+    heard = np.diff(newest, axis=0, prepend=-1) > 0
+    distances = []
+    for b, key in enumerate(memory["key"]):
+        drawn, own = network.drawn(int(key)), lost[..., b]
+        loss, burst = drawn.loss, drawn.burst
+        eigenvalue = 1.0 - 1.0 / burst - loss / (burst * (1.0 - loss))
+        deviation = np.sqrt(loss * (1.0 - loss) / own.size * (1.0 + eigenvalue) / (1.0 - eigenvalue))
+        starts = (own[1:] & ~own[:-1]).sum()
+        lengths = (own[1:].sum() - (own[0] & own[1]).sum()) / starts
+        distances.append(
+            ((own.mean() - loss) / deviation, (lengths - burst) / np.sqrt(max(burst * (burst - 1.0), 1e-2) / starts))
+        )
+        found = age[..., b][heard[..., b]]
+        assert found.max() <= drawn.most_rounds_late, b
+        assert found.min() >= drawn.fewest_rounds_late, b
+    assert np.abs(distances).max() < 5.0
+    assert np.std(distances, axis=0) == pytest.approx([1.0, 1.0], abs=0.4)
+
+
+@given(network=NETWORKS, seed=SEEDS)
+def test_an_episode_over_ranges_is_that_over_what_it_drew(network: Network, seed: int) -> None:
+    channel, memory = started(network, [seed], width=1)
+    drawn, own = started(network.drawn(int(memory["key"][0])), [seed], width=1)
+    for number in range(80):
+        values = np.full((1, 1), float(number))
+        channel.exchange(memory, values)
+        drawn.exchange(own, values)
+        for name in ("key", "round", "bad", "newest", "heard"):
+            np.testing.assert_array_equal(memory[name], own[name], name)
 
 
 def test_links_and_environments_lose_independently() -> None:

@@ -5,9 +5,12 @@ import pickle
 import networkx as nx
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from khop_env.network import PROFILES, Channel, Network
 from khop_env.physics import Links
+from tests.strategies import NETWORKS
 
 
 def test_profiles_are_those_of_the_design() -> None:
@@ -21,8 +24,10 @@ def test_profiles_are_those_of_the_design() -> None:
         "espnow": (40, 0, 0.08),
         "crazyradio": (26, 0, 0.3),
     }
-    assert list(PROFILES) == list(latency_jitter_loss)
-    for name, each in PROFILES.items():
+    assert list(PROFILES) == [*latency_jitter_loss, "random"]
+    for name in latency_jitter_loss:
+        each = PROFILES[name]
+        assert not each.ranges
         assert (1e3 * each.latency, 1e3 * each.jitter, each.loss) == pytest.approx(latency_jitter_loss[name])
 
 
@@ -35,6 +40,11 @@ def test_a_network_by_name_text_mapping_or_itself() -> None:
     assert Network.of({"loss": [0.1, 0.3]}) == Network(loss=(0.1, 0.3))
     assert Network.of("ideal:loss=0.1..0.3,latency=0.01..0.02") == Network(loss=(0.1, 0.3), latency=(0.01, 0.02))
     assert Network.of("lossy:burst=none").burst is None
+    drawn = Network(loss=(0.0, 0.3), burst=(1.0, 4.0), latency=(0.01, 0.1), jitter=(0.0, 0.005))
+    assert Network.of("random:loss=0..0.3,burst=1..4") == drawn
+    assert Network.of({"profile": "random", "loss": [0, 0.3], "burst": [1, 4]}) == drawn
+    assert pickle.loads(pickle.dumps(drawn)) == drawn
+    assert drawn.ranges == {"loss": (0.0, 0.3), "latency": (0.01, 0.1), "burst": (1.0, 4.0), "jitter": (0.0, 0.005)}
     assert Network.of(wanted) is wanted
     assert pickle.loads(pickle.dumps(wanted)) == wanted
     assert hash(Network(loss=[0.1, 0.3])) == hash(Network(loss=(0.1, np.float64(0.3))))
@@ -46,6 +56,34 @@ def test_described_in_a_line() -> None:
         Network.of("lossy:loss=0.1..0.3,burst=5,noise=0.1").described()
         == "a message every 50 ms, 10 to 30 % lost in bursts of 5, 30 +- 5 ms late, noise up to 0.1"
     )
+    assert (
+        PROFILES["random"].described()
+        == "a message every 50 ms, 0 to 50 % lost in bursts of 1 to 8, 10 to 100 +- 0 to 5 ms late"
+    )
+
+
+@given(network=NETWORKS, key=st.integers(0, 2**64 - 1))
+def test_what_is_drawn_lies_in_its_range_and_is_a_network(network: Network, key: int) -> None:
+    drawn = network.drawn(key)
+    assert not drawn.ranges
+    assert drawn == network.drawn(key)
+    assert drawn.drawn(key) is drawn
+    for name in ("loss", "latency", "jitter", *([] if network.burst is None else ["burst"])):
+        low, high = network.bounds(name)
+        assert low <= getattr(drawn, name) <= high, name
+    assert (drawn.period, drawn.noise, drawn.burst is None) == (network.period, network.noise, network.burst is None)
+    assert network.fewest_rounds_late <= drawn.fewest_rounds_late <= drawn.most_rounds_late <= network.most_rounds_late
+
+
+def test_each_value_is_uniform_over_its_range_and_independent_of_the_others() -> None:
+    network = PROFILES["random"]
+    networks = [network.drawn(key) for key in range(4000)]
+    shares = []
+    for name, (low, high) in network.ranges.items():
+        shares.append([(getattr(each, name) - low) / (high - low) for each in networks])
+        counts = np.histogram(shares[-1], 10, (0.0, 1.0))[0]
+        assert ((counts - 400) ** 2 / 400).sum() < 35  # chi-squared with 9 degrees of freedom
+    assert np.abs(np.corrcoef(shares) - np.eye(4)).max() < 5.0 / np.sqrt(4000)
 
 
 @pytest.mark.parametrize(
@@ -65,6 +103,18 @@ def test_described_in_a_line() -> None:
         ("wifi:period=0", "period must be positive"),
         ("wifi:period=inf", "period must be positive"),
         ("wifi:burst=0.5", "at least 1"),
+        ("wifi:burst=0.5..2", r"at least 1; got \(0.5, 2.0\)"),
+        ("wifi:burst=4..3", r"Network.burst must be .* low <= high; got \(4.0, 3.0\)"),
+        ("wifi:burst=1..inf", "at least 1"),
+        ("wifi:burst=none..2", "burst must be a number, or a range like"),
+        ("random:burst=", "burst must be a number, or a range like 0.1..0.3; got ''"),
+        ("random:loss=0..", "loss must be a number, or a range like"),
+        ("random:loss=0..0.6", "burst = 1 is too short for a loss of 0.6, .* take 1.5 or more .every value of a range"),
+        ("random:jitter=0..0.02", "at least the jitter of 0.02 s"),
+        ("random:jitter=0.002..0.001", r"Network.jitter must be .* low <= high"),
+        ("random:jitter=-0.1..0", "jitter must be finite and not negative"),
+        ("random:period=0.01..0.1", "Network.period must be a number"),
+        ("random:noise=0..0.1", "Network.noise must be a number"),
         ("wifi:loss=0.9,burst=5", "take 9 or more"),
         ("wifi:loss=1,burst=5", "take None"),
         ("wifi:jitter=0.02", "at least the jitter of 0.02 s"),

@@ -82,6 +82,7 @@ def test_the_summary_says_network_estimator_ages_and_violations(run):
     found = summary(recording, sim, paper())
     assert found["network"] == "a message every 50 ms, 30 % lost in bursts of 5, 10 +- 1 ms late"
     assert found["estimator"] == "relay"
+    assert "drawn" not in found
     assert (found["violations"], found["pair_samples"]) == (0, 40 * 101)
     ages = recording.states.age
     assert found["mean_age"] == pytest.approx(ages[np.isfinite(ages)].mean())
@@ -90,6 +91,16 @@ def test_the_summary_says_network_estimator_ages_and_violations(run):
     assert found["max_normalized_disagreement"] is None  # states are passed on: there is none
     assert found["uncertified"] == {}
     assert (found["bounds_kept"], found["funnel_kept"]) == (True, None)  # relay has no funnels
+
+
+def test_the_summary_says_what_was_drawn():
+    sim = simulator(paper(), Networked("random", "relay"))
+    recording = record(sim, 0.2, 0.01)
+    (drawn,) = sim.observers.drawn(sim.state)
+    assert recording.states.network == drawn
+    found = summary(recording, sim, paper())
+    assert found["drawn"] == {name: getattr(drawn, name) for name in ("loss", "latency", "burst", "jitter")}
+    assert "0 to 50 % lost in bursts of 1 to 8" in found["network"]
 
 
 def test_an_error_above_its_bound_is_counted_and_breaks_the_guarantee(run):

@@ -155,6 +155,7 @@ def test_the_figure_shows_both_estimators_at_all_periods_and_losses(tmp_path):
     assert [network.period for network in by_period] == list(SWEPT_PERIODS)
     assert [network.loss for network in by_loss] == list(SWEPT_LOSSES)
     assert [network.loss for network in sweeps(Network(burst=2.0))[1]] == [0.01, 0.03, 0.1, 0.3, 0.6]
+    assert [network.loss for network in sweeps(Network(burst=(1.0, 9.0)))[1]] == [0.01, 0.03, 0.1, 0.3]
     row = measured(["ideal"], ["relay"], duration=0.2)[0]
     rows = [dataclasses.replace(row, period=period) for period in SWEPT_PERIODS]
     rows += [dataclasses.replace(row, estimator="ppso", mean_bound=None, bound_to_limit=None) for row in rows]
@@ -173,11 +174,18 @@ def test_a_largest_error_above_the_mean_bound_is_no_violation():
 
 
 class TestReport:
-    @pytest.mark.parametrize("text", ["ideal", "wifi", "ideal:loss=0.5", "espnow", "ideal:loss=0.3,burst=5"])
+    @pytest.mark.parametrize(
+        "text",
+        [
+            *("ideal", "wifi", "ideal:loss=0.5", "espnow", "ideal:loss=0.3,burst=5"),
+            *("ideal:loss=0..0.8", "ideal:loss=0.1..0.5,burst=2..6,latency=0.02..0.12"),
+        ],
+    )
     def test_the_expected_age_is_the_mean_age_over_a_path(self, text):
         """Agents on a line hear of each other over one path."""
         scenario, network = line(), Network.of(text)
-        simulator = scenario.build(observers=Networked(network, "relay"), num_envs=100).reset(0)
+        episodes = 400 if network.ranges else 100
+        simulator = scenario.build(observers=Networked(network, "relay"), num_envs=episodes).reset(0)
         for _ in range(300):
             simulator.step(0.01)
         ages = np.zeros(scenario.design.knowledge.pairs)

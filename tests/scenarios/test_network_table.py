@@ -12,6 +12,7 @@ NETWORKS = [
     *PROFILES.values(),
     Network.of("lossy:period=0.1,loss=0.1..0.3,burst=5"),
     Network(latency=(0.0, 0.2), noise=0.01),
+    Network.of("random:loss=0..0.6,burst=2..4"),
 ]
 
 
