@@ -28,6 +28,8 @@ from benchmarks.publish import commit
 from benchmarks.study import (
     CORE_HOURS,
     NAVIGATION,
+    NETWORKS,
+    RANDOM,
     RECIPES,
     SEEDS,
     TASKS,
@@ -40,6 +42,7 @@ from benchmarks.study import (
 from benchmarks.study_curves import FIGURES, draw, exploration
 from benchmarks.study_measured import EPISODES, Block, measure
 from benchmarks.study_table import largest_ratios, summary, table
+from khop_env.network import PROFILES, Network
 from khop_env.physics import did_you_mean
 from khop_env.registry import make_batched
 
@@ -216,7 +219,7 @@ def _method(tasks: Sequence[StudyTask], episodes: int) -> Iterator[str]:
         where = "all others" if name not in NAVIGATION else "navigation"
         network = f"`{recipe.network}`" if recipe.network else "its scenario's network" if where == "navigation" else ""
         yield f"| {name} | {settings} | {network or 'continuous exchange'} | {where} |"
-    yield ""
+    yield f"\n{_networks()}\n"
     for task in tasks:
         yield f"- `khop train {task.environment} --scenario {task.scenario}`: {_own_settings(task)}"
     yield (
@@ -242,6 +245,14 @@ def _method(tasks: Sequence[StudyTask], episodes: int) -> Iterator[str]:
         "consensus estimates aren't decisive. They are where an agent follows a moving reference that isn't its "
         "neighbour.\n"
     )
+
+
+def _networks() -> str:
+    """The networks in words."""
+    names = (*NETWORKS, RANDOM)
+    known = {name: Network.of(name) for name in names if name.partition(":")[0] in PROFILES}
+    described = (f"`{name}`, {network.described()}" for name, network in known.items() if network is not None)
+    return f"Networks: {'; '.join(described)}."
 
 
 def _own_settings(task: StudyTask) -> str:

@@ -184,11 +184,17 @@ def _compared(title: str, ours: Row | None, theirs: Row | None, aim: str, key: s
         return Finding(title, "not trained yet", aim, "open: not trained yet", "")
     half = f" ± {short(found.half)}" if math.isfinite(found.half) else ""
     brief = found.relative.removesuffix(" %") + half
-    return Finding(title, str(found), aim, _verdict(aim, found, _complete(ours)) if aim else "", brief)
+    return Finding(title, str(found), aim, outcome_of(aim, found, _complete(ours)) if aim else "", brief)
 
 
-def _verdict(aim: str, found: Difference, complete: bool) -> str:
-    """What became of an aim: reached, missed by how much, or open."""
+def outcome_of(aim: str, found: Difference, complete: bool) -> str:
+    """What became of an aim: reached, missed by how much, or open.
+
+    Args:
+        aim: of `AIMS`, one that is about a difference.
+        found: from what it is compared with.
+        complete: whether all training seeds have finished.
+    """
     if found.over_seeds is None:
         return "open: one seed"
     low, high = found.percent - found.half, found.percent + found.half

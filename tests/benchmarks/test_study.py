@@ -26,8 +26,8 @@ from benchmarks.study import (
 )
 from benchmarks.study import runs as runs_of
 from benchmarks.study_measured import KEPT, Block, Row
-from benchmarks.study_statistics import difference, iqm, iqm95
-from benchmarks.study_table import findings, summary, table
+from benchmarks.study_statistics import Difference, difference, iqm, iqm95
+from benchmarks.study_table import AT_LEAST, PAY, WITHIN, findings, outcome_of, summary, table
 from khop_env.results import learning_curves
 
 TINY = (
@@ -63,7 +63,7 @@ def row(name, play, returns, learned=True, seeds=None, **others):
     [
         ([[-1.0, -2.0], [-1.1, -2.1]], [[-3.0, -4.0], [-3.1, -4.1]], "better"),
         ([[-3.0, -4.0], [-3.1, -4.1]], [[-1.0, -2.0], [-1.1, -2.1]], "worse"),
-        ([[-1.0, -2.0], [-3.0, -4.0]], [[-3.0, -4.0], [-1.0, -1.9]], "no clear difference"),  # seeds differ
+        ([[0.0, -1.0], [-4.0, -5.0]], [[-3.0, -4.0], [-3.0, -4.0]], "no clear difference"),  # seeds differ
         ([[-1.0, -4.0], [-1.0, -4.0]], [[-3.0, -1.9], [-3.0, -1.9]], "no clear difference"),  # episodes differ
         ([[-1.0, -2.0], [-1.0, -2.0]], [[-1.0, -2.0], [-1.0, -2.0]], "level"),
         ([[-1.0, -2.0]], [[-3.0, -4.0]], "one seed only"),
@@ -74,6 +74,27 @@ def test_verdicts_need_both_intervals(ours, theirs, word):
     assert found.word == word
     assert found.mean == pytest.approx(np.mean(ours) - np.mean(theirs))
     assert found.percent == pytest.approx(100 * found.mean / abs(np.mean(theirs)))
+
+
+@pytest.mark.parametrize(
+    ("aim", "percent", "half", "outcome"),
+    [
+        (WITHIN, -2.0, 0.5, "reached"),
+        (WITHIN, -2.0, 2.0, "open"),
+        (WITHIN, -5.0, 1.0, "missed by 2 %"),
+        (AT_LEAST, -2.0, 0.5, "missed by 2 %"),
+        (AT_LEAST, -0.5, 2.0, "reached: level"),
+        (AT_LEAST, -2.0, 2.5, "open"),
+        (AT_LEAST, 2.0, 0.5, "reached: better"),
+        (PAY, 2.0, 2.5, "missed: no clear difference"),
+        (PAY, 2.0, 1.5, "reached: better"),
+        (PAY, 2.0, None, "open: one seed"),
+    ],
+)
+def test_what_became_of_an_aim(aim, percent, half, outcome):
+    assert outcome_of(aim, Difference(percent / 10, 0.01, half and half / 10, -10.0), complete=True) == outcome
+    later = "open: no clear difference yet" if outcome == "missed: no clear difference" else outcome
+    assert outcome_of(aim, Difference(percent / 10, 0.01, half and half / 10, -10.0), complete=False) == later
 
 
 def test_differences_are_of_common_seeds():
