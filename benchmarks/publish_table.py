@@ -86,7 +86,8 @@ def main(arguments: Sequence[str] | None = None, tasks: Sequence[StudyTask] = TA
         until = start + 3600.0 * options.hours
         problems = train_all(chosen, options.root, workers=options.workers, until=until, commit=commit(), say=_say)
         problems += [f"{run.label}: {state.text}" for run in every if (state := state_of(run, options.root)).text]
-        blocks = measure(options.root, tasks, episodes=options.episodes, workers=options.workers, say=_say)
+        blocks, unplayed = measure(options.root, tasks, episodes=options.episodes, workers=options.workers, say=_say)
+        problems += unplayed
     except (KeyboardInterrupt, Interrupted):
         _say(
             "interrupted: finished trainings and measurements are kept, others go on from their last evaluation with "

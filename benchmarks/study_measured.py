@@ -16,6 +16,7 @@ import numpy as np
 import khop_env
 from agents.comparison import compare
 from agents.tuned import PATH as TUNED
+from agents.workers import UnfinishedError
 from benchmarks.study import CONTINUOUS, FILTER, NETWORKS, RECIPES, SCRIPTS, SEEDS, Play, Run, StudyTask, in_processes
 from benchmarks.study import state_of as run_state
 from khop_env.observers import FloatArray
@@ -108,7 +109,7 @@ def measure(
     *,
     workers: int = 2,
     say: Callable[[str], None] = print,
-) -> list[Block]:
+) -> tuple[list[Block], list[str]]:
     """Play all scripts and all finished policies over the same episodes.
 
     What was measured is kept in the folder `measured`, by the contents of the policy's file, and not measured again;
@@ -121,6 +122,12 @@ def measure(
         episodes: seeds of the episodes.
         workers: number of processes; 1 for this one.
         say: called with a line from time to time.
+
+    Returns:
+        The blocks, and a line for every trained policy that couldn't be played, whose row goes without it.
+
+    Raises:
+        RuntimeError: if a script couldn't be played.
     """
     plan: dict[str, _Job] = {}
     made = []
@@ -139,19 +146,23 @@ def measure(
                 rows.append((name, play, True, keys))
         made.append((task, rows))
     missing = [job for job in plan.values() if _load(root, job.key) is None]
-    for count, _ in enumerate(in_processes(_play, missing, workers), 1):
+    problems = []
+    for count, (number, problem) in enumerate(in_processes(_play, missing, workers), 1):
+        if problem:
+            problems.append(f"{missing[number].name} on {missing[number].task.label}: {problem}")
+            say(problems[-1])
         if count % 20 == 0 or count == len(missing):
             say(f"played {count} of {len(missing)}")
-    return [
-        Block(
-            task,
-            [
-                Row(name, play, tuple(keys), [_loaded(root, key) for key in keys.values()], learned)
-                for name, play, learned, keys in rows
-            ],
-        )
-        for task, rows in made
-    ]
+    blocks = []
+    for task, rows in made:
+        block = []
+        for name, play, learned, keys in rows:
+            found = {seed: run for seed, key in keys.items() if (run := _load(root, key)) is not None}
+            if not learned and not found:
+                raise RuntimeError(f"there is no table without its scripts: {'; '.join(problems)}")
+            block.append(Row(name, play, tuple(found), tuple(found.values()), learned))
+        blocks.append(Block(task, block))
+    return blocks, problems
 
 
 def _scripts(task: StudyTask) -> list[tuple[str, Play]]:
@@ -198,17 +209,20 @@ def _digest_of(file: Path, _: int) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def _play(job: _Job) -> None:
-    """Play one policy, and write what was measured."""
+def _play(job: _Job) -> str:
+    """Play one policy, and write what was measured; in words what went wrong, "" if nothing did."""
     networks = None if job.play.network is None else [job.play.network]
-    compared = compare(
-        job.task.environment,
-        [job.name],
-        [job.play.observe],
-        scenario=job.task.scenario,
-        seeds=job.episodes,
-        networks=networks,
-    )
+    try:
+        compared = compare(
+            job.task.environment,
+            [job.name],
+            [job.play.observe],
+            scenario=job.task.scenario,
+            seeds=job.episodes,
+            networks=networks,
+        )
+    except (ValueError, UnfinishedError) as error:
+        return f"can't be played on {job.play}: {error}"
     episodes = compared.rows[0].episodes
     values = {key: getattr(episodes, key) for key in KEPT} | dict(episodes.outcomes)
     path = _path(job.root, job.key)
@@ -216,6 +230,7 @@ def _play(job: _Job) -> None:
     partial = path.with_name(f".{path.stem}.part.npz")
     np.savez(partial, **values)
     partial.replace(path)
+    return ""
 
 
 def _path(root: Path, key: str) -> Path:
@@ -229,9 +244,3 @@ def _load(root: Path, key: str) -> Measured | None:
             return dict(file) if set(KEPT) <= set(file) else None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return None
-
-
-def _loaded(root: Path, key: str) -> Measured:
-    found = _load(root, key)
-    assert found is not None, key
-    return found

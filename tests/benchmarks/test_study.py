@@ -298,6 +298,14 @@ def test_the_command_is_interrupted_and_continued(tmp_path, monkeypatch, capsys)
     assert (len(trained), len(played)) == (5, 1)
     assert page.read_text().partition("## What")[2] == text.partition("## What")[2]
 
+    policy = Run(TINY[1], "estimate", 0).folder(root) / "best.npz"
+    whole = policy.read_bytes()
+    policy.write_bytes(b"half")
+    assert publish_table.main([*command, "--hours", "0"], TINY) == 1
+    assert f"ppo:{policy.parent} on leader_following_v0 on convoy: can't be played" in capsys.readouterr().out
+    assert page.read_text().count("| 1/5 | -") == 6
+    policy.write_bytes(whole)
+
     longer = dataclasses.replace(TINY[1], timesteps=5000)
     assert publish_table.main([*command, "--hours", "0"], (TINY[0], longer)) == 1
     assert "timesteps = 4000 and not 5000" in capsys.readouterr().out
