@@ -154,6 +154,10 @@ class TrainingConfig:
             raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
         if self.policy not in get_args(PolicyNetwork):
             raise ValueError(f"policy must be one of {', '.join(get_args(PolicyNetwork))}; got {self.policy!r}")
+        if self.critic not in get_args(Critic):
+            raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
+        if self.critic == "state" and self.policy != "mlp":
+            raise ValueError(f"critic 'state' is for policy 'mlp', and not for {self.policy!r}")
         if self.policy != "mlp":
             raise ValueError(f"policy {self.policy!r} isn't there yet: choose 'mlp'")
         if self.observe not in OBSERVE:
@@ -163,10 +167,6 @@ class TrainingConfig:
                 Network.of(self.evaluate_network)
             except ValueError as error:
                 raise ValueError(f"evaluate_network: {error}") from None
-        if self.critic not in get_args(Critic):
-            raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
-        if self.critic == "state" and self.policy != "mlp":
-            raise ValueError(f"critic 'state' is for policy 'mlp', and not for {self.policy!r}")
         if self.per_type and self.algorithm == "sac":
             raise ValueError("per_type is for 'ppo'; 'sac' trains one network for all agents")
         for name in ("timesteps", "num_envs", "n_steps", "batch_size", "n_epochs", "evaluations"):
