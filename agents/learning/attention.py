@@ -21,13 +21,11 @@ class SlotAttention(BaseFeaturesExtractor):
     attention (Bahdanau et al. 2015, https://arxiv.org/abs/1409.0473), where the own columns are the query. Without
     valid slots the averages are 0. Features are the own columns and the averages.
 
-        env = make_sb3_vec("formation_v0", "random_geometric:agents=12", num_envs=8)
-        extractor = {
+        policy_kwargs = {
             "features_extractor_class": SlotAttention,
             "features_extractor_kwargs": SlotAttention.widths(env.batched.layouts[0]),
             "share_features_extractor": False,
         }
-        model = PPO("MlpPolicy", env, policy_kwargs=extractor)
 
     Args:
         space: of observations, which begin with the own columns.
