@@ -38,7 +38,7 @@ class SlotAttention(BaseFeaturesExtractor):
         ValueError: if the observations aren't own columns and whole slots, or `heads` is no divisor.
     """
 
-    def __init__(self, space: gym.Space, own: int, slot: int, width: int = 32, heads: int = 4) -> None:
+    def __init__(self, space: gym.Space, own: int, slot: int, width: int = 64, heads: int = 4) -> None:
         super().__init__(space, own + width)
         columns = space.shape[-1] if space.shape else 0
         if columns <= own or (columns - own) % slot:
