@@ -21,13 +21,11 @@ class SlotAttention(BaseFeaturesExtractor):
     attention (Bahdanau et al. 2015, https://arxiv.org/abs/1409.0473), where the own columns are the query. Without
     valid slots the averages are 0. Features are the own columns and the averages.
 
-        env = make_sb3_vec("formation_v0", "random_geometric:agents=12", num_envs=8)
-        extractor = {
+        policy_kwargs = {
             "features_extractor_class": SlotAttention,
             "features_extractor_kwargs": SlotAttention.widths(env.batched.layouts[0]),
             "share_features_extractor": False,
         }
-        model = PPO("MlpPolicy", env, policy_kwargs=extractor)
 
     Args:
         space: of observations, which begin with the own columns.
@@ -40,7 +38,7 @@ class SlotAttention(BaseFeaturesExtractor):
         ValueError: if the observations aren't own columns and whole slots, or `heads` is no divisor.
     """
 
-    def __init__(self, space: gym.Space, own: int, slot: int, width: int = 32, heads: int = 4) -> None:
+    def __init__(self, space: gym.Space, own: int, slot: int, width: int = 64, heads: int = 4) -> None:
         super().__init__(space, own + width)
         columns = space.shape[-1] if space.shape else 0
         if columns <= own or (columns - own) % slot:

@@ -223,6 +223,8 @@ def load_actor(model: BaseAlgorithm, networks: Mapping[str, Network]) -> None:
     parameters = [*extractor.parameters(), *(each for layer in layers for each in layer.parameters())]
     with torch.no_grad():
         for parameter, array in zip(parameters, networks[""].arrays().values(), strict=True):  # in the same order
+            if parameter.shape != array.shape:
+                raise ValueError(f"its layers have shapes as {array.shape}, and here {tuple(parameter.shape)}")
             parameter.copy_(torch.as_tensor(array))
 
 
