@@ -162,6 +162,10 @@ class TrainingConfig:
             raise ValueError(
                 f"{name} is for policy 'mlp': attention treats all slots alike, by one network for all agents"
             )
+        if self.critic not in get_args(Critic):
+            raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
+        if self.critic == "state" and self.policy == "recurrent":
+            raise ValueError("critic 'state' is for policies 'mlp' and 'attention'; policy is 'recurrent'")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
         if self.evaluate_network is not None:
@@ -169,10 +173,6 @@ class TrainingConfig:
                 Network.of(self.evaluate_network)
             except ValueError as error:
                 raise ValueError(f"evaluate_network: {error}") from None
-        if self.critic not in get_args(Critic):
-            raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
-        if self.critic == "state" and self.policy != "mlp":
-            raise ValueError(f"critic 'state' is for policy 'mlp', and not for {self.policy!r}")
         if self.per_type and self.algorithm == "sac":
             raise ValueError("per_type is for 'ppo'; 'sac' trains one network for all agents")
         for name in ("timesteps", "num_envs", "n_steps", "batch_size", "n_epochs", "evaluations"):
