@@ -164,8 +164,8 @@ class TrainingConfig:
             )
         if self.critic not in get_args(Critic):
             raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
-        if self.critic == "state" and self.policy != "mlp":
-            raise ValueError(f"critic 'state' is for policy 'mlp', and not for {self.policy!r}")
+        if self.critic == "state" and self.policy == "recurrent":
+            raise ValueError("critic 'state' is for policies 'mlp' and 'attention'; policy is 'recurrent'")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
         if self.evaluate_network is not None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
@@ -19,7 +20,7 @@ from agents.learning.forward import Attention, Layers, Mlp, Network
 from agents.learning.learned import LearnedPolicy
 from agents.learning.scaling import ObservationScaler
 from agents.learning.slots import SlotScaler
-from agents.learning.state_critic import StateCriticPolicy, StateCriticSACPolicy
+from agents.learning.state_critic import BesideState, StateCriticPolicy, StateCriticSACPolicy
 
 REPLAY = 400_000  # agent-steps that SAC learns from, the last ones
 
@@ -112,9 +113,7 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
 def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
     common: dict[str, Any] = {"seed": config.seed, "gamma": config.gamma, "tensorboard_log": log, "device": "cpu"}
     net: dict[str, Any] = {"activation_fn": nn.ReLU, **_extractor(config, env)}
-    sees_state, wrapped = config.critic == "state", cast(Any, env)
-    if sees_state:
-        net["state"] = wrapped.state.size
+    sees_state = config.critic == "state"
     if config.algorithm == "sac":
         return SAC(
             StateCriticSACPolicy if sees_state else "MlpPolicy",
@@ -129,6 +128,8 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
             **common,
         )
     net["log_std_init"] = config.log_std
+    if sees_state:
+        net["state"] = net["features_extractor_kwargs"]["state"]
     if config.per_type:
         policy: Any = PerTypePolicy
         net |= {"types": list(types), "hidden": list(config.hidden)}
@@ -153,14 +154,21 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
 
 def _extractor(config: TrainingConfig, env: VecEnv) -> dict[str, Any]:
     """What a policy of Stable-Baselines3 gets to extract features; actor and critic have extractors of their own."""
-    if config.policy != "attention":
-        return {}
-    scaler: SlotScaler = env.scaler  # type: ignore[attr-defined]
-    return {
-        "features_extractor_class": SlotAttention,
-        "features_extractor_kwargs": {"own": len(scaler.own), "slot": len(scaler.slot)},
-        "share_features_extractor": False,
-    }
+    found: dict[str, Any] = {}
+    wrapped: Any = env
+    if config.policy == "attention":
+        scaler: SlotScaler = wrapped.scaler
+        found = {
+            "features_extractor_class": SlotAttention,
+            "features_extractor_kwargs": {"own": len(scaler.own), "slot": len(scaler.slot)},
+            "share_features_extractor": False,
+        }
+    if config.critic == "state":
+        inner = found.get("features_extractor_class", FlattenExtractor)
+        arguments = {"inner": inner, "arguments": found.get("features_extractor_kwargs", {})}
+        found["features_extractor_class"] = BesideState
+        found["features_extractor_kwargs"] = {"state": wrapped.state.size, **arguments}
+    return found
 
 
 def _divisor(samples: int, wanted: int) -> int:
@@ -232,8 +240,10 @@ def _actor(model: BaseAlgorithm) -> tuple[nn.Module, list[nn.Module]]:
     """The extractor, and the modules from there to the action's mean, of a model with one network for all agents."""
     policy: Any = model.policy
     if isinstance(model, SAC):
-        return policy.actor.features_extractor, [*policy.actor.latent_pi, policy.actor.mu]
-    return policy.pi_features_extractor, [*policy.mlp_extractor.policy_net, policy.action_net]
+        extractor, layers = policy.actor.features_extractor, [*policy.actor.latent_pi, policy.actor.mu]
+    else:
+        extractor, layers = policy.pi_features_extractor, [*policy.mlp_extractor.policy_net, policy.action_net]
+    return extractor.inner if isinstance(extractor, BesideState) else extractor, layers
 
 
 def exported(

@@ -6,12 +6,13 @@ Multi-Agent Games"), with what they call the agent-specific global state: an age
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from gymnasium.spaces import Box, Space
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 
@@ -61,39 +62,41 @@ class StateCriticPolicy(ActorCriticPolicy):
         return {**super()._get_constructor_parameters(), "state": self._state}
 
 
-class OwnFeatures(BaseFeaturesExtractor):
-    """All features but the last ones.
+class BesideState(BaseFeaturesExtractor):
+    """Features of an agent's own columns by another extractor, and the columns of the global state as they are.
 
     Args:
-        space: of all.
+        space: of all columns.
         state: number of the last ones, of the global state.
+        inner: makes the extractor of the others.
+        arguments: keyword arguments for `inner`.
+        kept: whether features end with the state, as a critic's do.
     """
 
-    def __init__(self, space: Space[Any], state: int) -> None:
+    def __init__(
+        self,
+        space: Space[Any],
+        state: int,
+        inner: type[BaseFeaturesExtractor] = FlattenExtractor,
+        arguments: Mapping[str, Any] | None = None,
+        kept: bool = True,
+    ) -> None:
         assert isinstance(space, Box)
-        super().__init__(space, int(space.shape[0]) - state)
+        own = Box(space.low[:-state], space.high[:-state])
+        extractor = inner(own, **arguments or {})
+        super().__init__(space, extractor.features_dim + state * kept)
+        self.inner, self._own, self._kept = extractor, own.shape[0], kept
 
-    def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """An agent's own features (batch, own)."""
-        return features[:, : self.features_dim]
+    def forward(self, columns: torch.Tensor) -> torch.Tensor:
+        """Features (batch, features)."""
+        features: torch.Tensor = self.inner(columns[:, : self._own])
+        return torch.cat([features, columns[:, self._own :]], dim=1) if self._kept else features
 
 
 class StateCriticSACPolicy(SACPolicy):
-    """SAC's policy with critics that see the global state.
-
-    Args:
-        arguments: positional arguments of `SACPolicy`.
-        state: number of the last features, of the global state.
-        keywords: keyword arguments of `SACPolicy`.
-    """
-
-    def __init__(self, *arguments: Any, state: int, **keywords: Any) -> None:
-        self._state = state
-        super().__init__(*arguments, **keywords)
+    """SAC's policy with critics that see the global state; its features extractor has to be `BesideState`."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """The actor, which gets an agent's own features only."""
-        return super().make_actor(OwnFeatures(self.observation_space, self._state))
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "state": self._state}
+        arguments = {**self.features_extractor_kwargs, "kept": False}
+        return super().make_actor(self.features_extractor_class(self.observation_space, **arguments))

@@ -80,15 +80,17 @@ def test_rows_end_with_the_state_of_their_time(environment, scenario, settings):
     assert learner.observation_space.contains(rows[0])
 
 
-KINDS = [{}, {"per_type": True}, {"algorithm": "sac"}]
-NAMES = ["ppo", "per_type", "sac"]
+SLOTS = {"policy": "attention", "scenario": "paper"}
+KINDS = [{}, {"per_type": True}, {"algorithm": "sac"}, SLOTS, {**SLOTS, "algorithm": "sac"}]
+NAMES = ["ppo", "per_type", "sac", "attention", "attention by sac"]
 
 
 @pytest.mark.parametrize("changes", KINDS, ids=NAMES)
 def test_the_actor_does_not_see_the_state_and_the_critic_does(changes):
     run = _Run(config(**changes), None, None, None)
     run.learn()
-    model, own = run.algorithm, run.learner.scaler.size
+    model = run.algorithm
+    own = run.env.observation_space.shape[0] - run.learner.state.size
     rows = run.env.reset()
     other_state, other_own = rows.copy(), rows.copy()
     other_state[:, own:] += 1.0
@@ -214,8 +216,8 @@ def test_a_run_with_another_critic_gives_its_policy_only(tmp_path):
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="critic must be one of local, state; got 'global'"):
         config(critic="global")
-    with pytest.raises(ValueError, match="critic 'state' is for policy 'mlp', and not for 'attention'"):
-        config(policy="attention")
+    with pytest.raises(ValueError, match="critic 'state' is for policies 'mlp' and 'attention'; policy is 'recurrent'"):
+        config(policy="recurrent")
 
 
 def test_a_local_critic_is_as_before():
