@@ -49,7 +49,7 @@ class Finding(NamedTuple):
 
 def summary(blocks: Sequence[Block]) -> Iterator[str]:
     """A table of aims and tasks: reached, missed by how much, or open."""
-    found = [(block.task.short, finding) for block in blocks for finding in findings(block)]
+    found = [(_of(block, finding), finding) for block in blocks for finding in findings(block)]
     yield "| aim | task | verdict | difference, % |"
     yield "|---|---|---|---|"
     for aim in AIMS:
@@ -66,6 +66,11 @@ def summary(blocks: Sequence[Block]) -> Iterator[str]:
         else:
             verdict = "open" if len(better) + undecided >= 3 else f"**missed** by {3 - len(better)}"
         yield f"| {kind}{THREE} | {', '.join(better) or 'none'} | {verdict} | {len(better)} of {len(chosen)} |"
+
+
+def _of(block: Block, finding: Finding) -> str:
+    """The task of a finding; in navigation with the kind of training, of which several are aimed at."""
+    return f"{block.task.short}, {finding.title.partition(',')[0]}" if block.navigates else block.task.short
 
 
 def table(block: Block) -> Iterator[str]:
@@ -160,19 +165,24 @@ def findings(block: Block) -> Iterator[Finding]:
 
 
 def _navigation(block: Block) -> Iterator[Finding]:
-    inside, shielded = Play(inside=FILTER), block.row("shielded", Play(inside=FILTER))
-    if shielded is None:
-        yield Finding("shielded, collisions", "not trained yet", NO_COLLISION, "open: not trained yet")
-    else:
-        collided = shielded.values("collision")
-        text = f"{int(collided.sum())} of {collided.size} episodes"
-        verdict = "missed" if collided.any() else "reached" if _complete(shielded) else "open: seeds are missing"
-        yield Finding("shielded, collisions", text, NO_COLLISION, verdict, text.removesuffix(" episodes"))
+    inside = Play(inside=FILTER)
     by_return, by_success = block.best(inside), block.best(inside, "success")
-    title = f"shielded, return against {_script(by_return)} in the same filter"
-    yield _compared(title, shielded, by_return, ABOVE)
-    title = f"shielded, share of successes against {_script(by_success)} in the same filter"
-    yield _compared(title, shielded, by_success, ARRIVE, "success")
+    for name in ("shielded", "shielded residual"):
+        if name not in block.task.recipes:
+            continue
+        shielded = block.row(name, inside)
+        if shielded is None:
+            yield Finding(f"{name}, collisions", "not trained yet", NO_COLLISION, "open: not trained yet")
+        else:
+            collided = shielded.values("collision")
+            text = f"{int(collided.sum())} of {collided.size} episodes"
+            verdict = "missed" if collided.any() else "reached" if _complete(shielded) else "open: seeds are missing"
+            yield Finding(f"{name}, collisions", text, NO_COLLISION, verdict, text.removesuffix(" episodes"))
+        title = f"{name}, return against {_script(by_return)} in the same filter"
+        yield _compared(title, shielded, by_return, ABOVE)
+        title = f"{name}, share of successes against {_script(by_success)} in the same filter"
+        yield _compared(title, shielded, by_success, ARRIVE, "success")
+    shielded = block.row("shielded", inside)
     other = block.row("not shielded", inside)
     for key, what in (("returns", "return"), ("success", "share of successes")):
         yield _compared(f"in the filter, {what}: trained in it, against trained alone", shielded, other, "", key)

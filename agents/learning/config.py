@@ -39,6 +39,8 @@ SUITED: Mapping[str, Mapping[str, Any]] = {
         "n_epochs": 5,
         "entropy": 0.003,
         "log_std": -0.5,
+        "log_std_end": 0.0,  # no limit
+        "reward_memory": 0,
         "arguments": {"penalty": 0.1, "goal_radius": 0.1},  # it learns to come nearer than it has to
     },
 }
