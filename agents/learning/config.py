@@ -155,13 +155,14 @@ class TrainingConfig:
             raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
         if self.policy not in get_args(PolicyNetwork):
             raise ValueError(f"policy must be one of {', '.join(get_args(PolicyNetwork))}; got {self.policy!r}")
-        if self.policy == "recurrent":
-            raise ValueError("policy 'recurrent' isn't there yet: choose 'mlp' or 'attention'")
         if self.policy == "attention" and (self.per_type or self.nearest):
             name = "per_type" if self.per_type else "nearest"
             raise ValueError(
                 f"{name} is for policy 'mlp': attention treats all slots alike, by one network for all agents"
             )
+        if self.policy == "recurrent" and (self.algorithm == "sac" or self.per_type):
+            what = "per_type" if self.per_type else "algorithm 'sac'"
+            raise ValueError(f"policy 'recurrent' is trained by 'ppo', one network for all agents, without {what}")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
         if self.evaluate_network is not None:
