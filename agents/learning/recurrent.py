@@ -44,21 +44,28 @@ class RecurrentPolicy(RecurrentActorCriticPolicy):
     """Actor and critic are layers, an LSTM, and a linear layer each.
 
     Args:
-        arguments: positional arguments of `RecurrentActorCriticPolicy`.
+        observations: space of features.
+        actions: space of actions.
+        rate: schedule of the learning rate.
         hidden: widths of the layers; the last one is that of the LSTM.
         keywords: keyword arguments of `RecurrentActorCriticPolicy`.
     """
 
-    def __init__(self, *arguments: Any, hidden: Sequence[int], **keywords: Any) -> None:
+    def __init__(
+        self, observations: Space[Any], actions: Space[Any], rate: Any, *, hidden: Sequence[int], **keywords: Any
+    ) -> None:
         self._hidden = list(hidden)
-        own: dict[str, Any] = {
-            "net_arch": [],
-            "lstm_hidden_size": self._hidden[-1],
-            "features_extractor_class": Layers,
-            "features_extractor_kwargs": {"widths": self._hidden[:-1]},
-            "share_features_extractor": False,
-        }
-        super().__init__(*arguments, **own, **keywords)
+        super().__init__(
+            observations,
+            actions,
+            rate,
+            net_arch=[],
+            lstm_hidden_size=self._hidden[-1],
+            features_extractor_class=Layers,
+            features_extractor_kwargs={"widths": self._hidden[:-1]},
+            share_features_extractor=False,
+            **keywords,
+        )
 
     @staticmethod
     def _process_sequence(
