@@ -48,13 +48,14 @@ RANKS = [
 HEAVY = {
     "torch": ("agents", "benchmarks.peers"),  # the peers run in environments of their own
     "ray": ("agents",),
+    "sb3_contrib": ("agents.learning.recurrent",),
     "stable_baselines3": ("agents", "khop_env.env.sb3", "khop_env.testing.libraries", "benchmarks.peers"),
     "matplotlib": ("khop_env.results", "khop_env.env.rendering", "benchmarks.safety_film", "benchmarks.precision"),
     "pygame": ("khop_env.env.rendering",),
     "imageio_ffmpeg": ("khop_env.results",),
 }
 NOT_ON_IMPORT = {
-    *("matplotlib", "pygame", "torch", "ray", "stable_baselines3", "polars", "pandas", "rich", "typer", "tomlkit"),
+    *("matplotlib", "pygame", "torch", "ray", "stable_baselines3", "sb3_contrib", "polars", "pandas", "rich", "typer", "tomlkit"),
     *("scipy", "numba"),
 }
 STEPPING = (

@@ -14,9 +14,10 @@ from typer.testing import CliRunner
 from agents import describe, play
 from agents.learning import LearnedPolicy, PolicyFileError, TrainingConfig
 from agents.learning.archive import read_arrays, write_arrays
+from agents.learning.curve import EVALUATION_SEEDS
 from agents.learning.environment import build
 from agents.learning.recurrent import RecurrentPolicy
-from agents.learning.training import EVALUATION_SEEDS, _Run, train
+from agents.learning.training import _Run, train
 from agents.policy import by_agent
 from khop_env.cli import app
 from khop_env.network import Network
@@ -123,6 +124,14 @@ def test_the_lstm_in_training_is_that_of_sb3_contrib():
             found.append([outputs, *states, *(parameter.grad.clone() for parameter in lstm.parameters())])
         for ours, theirs in zip(*found, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_exploration_ends_on_schedule():
+    """As with PPO."""
+    run = _Run(config(timesteps=600, log_std=0.0, log_std_end=-2.0, explore=0.5), None, None, None)
+    run.learn()
+    assert run.algorithm.policy.log_std.max() < -1.0
+    assert run.algorithm.ent_coef < 0.01
 
 
 @pytest.mark.parametrize(
