@@ -24,6 +24,7 @@ Critic = Literal["local", "state"]
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
+    "recurrent": {"n_steps": 16},  # errors go back through memory as far as that
     "consensus_v0": {"gamma": 0.8},
     "leader_following_v0": {"huber": 0.2, "log_std_end": -1.0, "explore": 0.6},
     "attention": {"nearest": False},
@@ -74,7 +75,7 @@ class TrainingConfig:
         timesteps: agent-steps in all, of all copies together.
         seed: seed of networks, episodes and exploration.
         num_envs: copies of the environment, each of N agents.
-        hidden: widths of the networks' layers.
+        hidden: widths of the networks' layers; with policy "recurrent" the last one is that of the LSTM.
         learning_rate: learning rate at the beginning; falls linearly to 0 with "ppo".
         gamma: discount per control period, from 0 to 1.
         gae_lambda: lambda of the generalised advantage estimates, from 0 to 1; PPO.

@@ -221,14 +221,14 @@ def test_the_commands_train_and_play_it(tmp_path):
     arguments = ["leader_following_v0", "--policies", f"ppo:{out}", "--episodes", "3", *short, "--json"]
     found = khop(app, ["evaluate", *arguments])
     assert found.exit_code == 0, found.stderr
-    assert np.isfinite(json.loads(found.stdout)["policies"][0]["return"]["mean"])
+    assert np.isfinite(json.loads(found.stdout)["rows"][0]["mean_return"])
     run = ["run", "convoy", "--controller", f"ppo:{out}", "--network", LOSSY, "--out", str(tmp_path / "played")]
     assert khop(app, run).exit_code == 0
 
 
 def test_processes_play_it(tmp_path, monkeypatch):
     """One agent's process, which knows no other's observations, acts as the agent does in the environment."""
-    chosen = config("navigation_v0", scenario="swap:agents=4", arguments={"network": LOSSY})
+    chosen = config("navigation_v0", scenario="swap:agents=4", residual="go_to_goal", arguments={"network": LOSSY})
     strong(chosen).policy.save(tmp_path / "policy.npz")
     spec = f"filter:ppo:{tmp_path / 'policy.npz'}"
     lockstep("swap:agents=4", spec, Network(0.05, loss=0.3, burst=5.0), tmp_path, monkeypatch)
