@@ -55,8 +55,8 @@ HEAVY = {
     "imageio_ffmpeg": ("khop_env.results",),
 }
 NOT_ON_IMPORT = {
-    *("matplotlib", "pygame", "torch", "ray", "stable_baselines3", "sb3_contrib", "polars", "pandas", "rich", "typer", "tomlkit"),
-    *("scipy", "numba"),
+    *("matplotlib", "pygame", "torch", "ray", "stable_baselines3", "polars", "pandas", "rich", "typer", "tomlkit"),
+    *("scipy", "numba", "sb3_contrib"),
 }
 STEPPING = (
     "from khop_env import consensus_v0; env = consensus_v0.parallel_env(); env.reset(seed=0); "

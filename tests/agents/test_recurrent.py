@@ -81,7 +81,7 @@ def test_it_acts_like_the_model_over_an_episode(hidden, tmp_path):
     [("leader_following_v0", {}), ("consensus_v0", {"residual": "tanh"}), ("navigation_v0", {"nearest": True})],
 )
 def test_an_episode_that_begins_in_a_batch_is_new_to_it(environment, settings):
-    """Each environment's actions are those of a policy of its own, reset when its episode began; states are complete."""
+    """Each environment's actions are those of a policy of its own, reset when its episode began."""
     chosen = config(environment, **settings)
     whole = strong(chosen).policy
     fields = {each.name: getattr(whole, each.name) for each in dataclasses.fields(whole) if each.init}
