@@ -36,6 +36,7 @@ SLOW = tuple(
         "agents/test_initial.py",
         "agents/test_learned_policies.py",
         "agents/test_learning.py",
+        "agents/test_recurrent.py",
         "agents/test_residual.py",
         "agents/test_resuming.py",
         "agents/test_shielded.py::test_a_resumed_training",

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 EXTRAS = ("scipy", "torch", "tensorboard", "stable_baselines3", "supersuit", "pygame", "imageio_ffmpeg", "ray", "zenoh")
-EXTRAS += ("minari",)
+EXTRAS += ("minari", "sb3_contrib")
 SHORTER = {  # what makes a command take seconds; the code that it runs is the same
     "khop run": "--duration 0.05",
     "khop run paper --integrator explicit": "--duration 0.0005",

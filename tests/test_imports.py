@@ -48,6 +48,7 @@ RANKS = [
 HEAVY = {
     "torch": ("agents", "benchmarks.peers"),  # the peers run in environments of their own
     "ray": ("agents",),
+    "sb3_contrib": ("agents.learning.recurrent",),
     "stable_baselines3": ("agents", "khop_env.env.sb3", "khop_env.testing.libraries", "benchmarks.peers"),
     "matplotlib": ("khop_env.results", "khop_env.env.rendering", "benchmarks.safety_film", "benchmarks.precision"),
     "pygame": ("khop_env.env.rendering",),
@@ -55,7 +56,7 @@ HEAVY = {
 }
 NOT_ON_IMPORT = {
     *("matplotlib", "pygame", "torch", "ray", "stable_baselines3", "polars", "pandas", "rich", "typer", "tomlkit"),
-    *("scipy", "numba"),
+    *("scipy", "numba", "sb3_contrib"),
 }
 STEPPING = (
     "from khop_env import consensus_v0; env = consensus_v0.parallel_env(); env.reset(seed=0); "

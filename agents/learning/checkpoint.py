@@ -6,7 +6,7 @@ import dataclasses
 import json
 import random
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,7 @@ def model_state(model: BaseAlgorithm) -> dict[str, Any]:
         "variables": {name: attrgetter(name)(model) for name in variables},
         "counters": {name: getattr(model, name) for name in _COUNTERS},
         "last": {name: getattr(model, name) for name in _LAST},
+        "memory": _memory(model),
         "random": {
             "torch": torch.get_rng_state(),
             "numpy": np.random.get_state(),  # noqa: NPY002  # Stable-Baselines3 shuffles with it
@@ -138,6 +139,9 @@ def restore_model(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
             "one, and not as if it had never been interrupted",
             stacklevel=2,
         )
+    if own := [each.numpy() for each in _memory(model)]:
+        memory = [_tensors(each) for each in restored(own, stored["memory"], "memory")]
+        _set_memory(model, memory)
     torch.set_rng_state(_tensors(stored["random"]["torch"]))
     np.random.set_state(stored["random"]["numpy"])  # noqa: NPY002
     random.setstate(stored["random"]["python"])
@@ -151,6 +155,16 @@ def restore_networks(model: BaseAlgorithm, stored: Mapping[str, Any]) -> None:
     """
     own = _arrays(dict(model.policy.state_dict()))
     model.policy.load_state_dict(_tensors(restored(own, dict(stored["parameters"]["policy"]), "networks")))
+
+
+def _memory(model: Any) -> list[torch.Tensor]:
+    """What a recurrent model remembers of the running episodes: output and cell of the actor, and of the critic."""
+    states = getattr(model, "_last_lstm_states", None)
+    return [] if states is None else [*states.pi, *states.vf]
+
+
+def _set_memory(model: Any, memory: Sequence[torch.Tensor]) -> None:
+    model._last_lstm_states = type(model._last_lstm_states)(tuple(memory[:2]), tuple(memory[2:]))
 
 
 def _optimizer_state(optimizer: torch.optim.Optimizer, stored: Any, where: str) -> dict[str, Any]:

@@ -24,6 +24,7 @@ Critic = Literal["local", "state"]
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
+    "recurrent": {"n_steps": 16},  # errors go back through memory as far as that
     "consensus_v0": {"gamma": 0.8},
     "leader_following_v0": {"huber": 0.2, "log_std_end": -1.0, "explore": 0.6},
     "attention": {"nearest": False},
@@ -76,7 +77,7 @@ class TrainingConfig:
         timesteps: agent-steps in all, of all copies together.
         seed: seed of networks, episodes and exploration.
         num_envs: copies of the environment, each of N agents.
-        hidden: widths of the networks' layers.
+        hidden: widths of the networks' layers; with policy "recurrent" the last one is that of the LSTM.
         learning_rate: learning rate at the beginning; falls linearly to 0 with "ppo".
         gamma: discount per control period, from 0 to 1.
         gae_lambda: lambda of the generalised advantage estimates, from 0 to 1; PPO.
@@ -157,8 +158,6 @@ class TrainingConfig:
             raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
         if self.policy not in get_args(PolicyNetwork):
             raise ValueError(f"policy must be one of {', '.join(get_args(PolicyNetwork))}; got {self.policy!r}")
-        if self.policy == "recurrent":
-            raise ValueError("policy 'recurrent' isn't there yet: choose 'mlp' or 'attention'")
         if self.policy == "attention" and (self.per_type or self.nearest):
             name = "per_type" if self.per_type else "nearest"
             raise ValueError(
@@ -168,6 +167,9 @@ class TrainingConfig:
             raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
         if self.critic == "state" and self.policy == "recurrent":
             raise ValueError("critic 'state' is for policies 'mlp' and 'attention'; policy is 'recurrent'")
+        if self.policy == "recurrent" and (self.algorithm == "sac" or self.per_type):
+            what = "per_type" if self.per_type else "algorithm 'sac'"
+            raise ValueError(f"policy 'recurrent' is trained by 'ppo', one network for all agents, without {what}")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
         if self.evaluate_network is not None:

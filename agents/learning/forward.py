@@ -146,7 +146,62 @@ class Attention:
         return cls((encoder, bias), scores, read_layers(arrays, name, layers, own + width, outputs))
 
 
-NETWORKS: Mapping[str, type[Network]] = {each.kind: each for each in (Mlp, Attention)}
+@dataclass(frozen=True, eq=False)
+class Recurrent:
+    """Layers with an LSTM before the last one, which makes the outputs from what it remembers.
+
+    The LSTM is PyTorch's, with one bias instead of two: S. Hochreiter and J. Schmidhuber, Long short-term memory,
+    Neural Computation 9(8), 1997, with the forget gate of F. A. Gers, J. Schmidhuber and F. Cummins, 2000.
+
+    Attributes:
+        layers: one or more; ReLU after each but the last.
+        lstm: weights of its inputs (4 W, in) and of its own last output (4 W, W), and bias (4 W,), each of the input
+            gate, the forget gate, the candidate and the output gate.
+    """
+
+    kind: ClassVar[str] = "recurrent"
+    layers: Layers
+    lstm: tuple[Float32Array, Float32Array, Float32Array]
+
+    def __call__(self, features: Float32Array, memory: Memory) -> tuple[Float32Array, Memory]:
+        """Outputs (..., m), and the memory: the LSTM's output and its cell, (..., W) each."""
+        inputs = features
+        for weight, bias in self.layers[:-1]:
+            inputs = np.maximum(inputs @ weight.T + bias, 0.0)
+        from_inputs, from_before, bias = self.lstm
+        nothing = np.zeros((*features.shape[:-1], len(bias) // 4), np.float32)
+        before, cell = memory or (nothing, nothing)
+        gates = np.split(inputs @ from_inputs.T + before @ from_before.T + bias, 4, axis=-1)
+        cell = _sigmoid(gates[1]) * cell + _sigmoid(gates[0]) * np.tanh(gates[2])
+        output = _sigmoid(gates[3]) * np.tanh(cell)
+        return applied(self.layers[-1:], output), (output, cell)
+
+    def arrays(self) -> dict[str, Float32Array]:
+        """All arrays, by their names in a file."""
+        return named(self.layers) | dict(zip(_LSTM, self.lstm, strict=True))
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, np.ndarray], name: str, layers: int, inputs: int, outputs: int) -> Recurrent:
+        """The network in a file, as `Network.read`."""
+        first = read_layers(arrays, name, layers - 1, inputs)
+        width = len(np.atleast_1d(arrays[f"{name}/{layers - 1}/weight"]).T)
+        shapes = (4 * width, len(first[-1][1]) if first else inputs), (4 * width, width), (4 * width,)
+        lstm = [numbers(arrays, f"{name}/{part}", shape) for part, shape in zip(_LSTM, shapes, strict=True)]
+        last = numbers(arrays, f"{name}/{layers - 1}/weight", (outputs, width))
+        layer = last, numbers(arrays, f"{name}/{layers - 1}/bias", (outputs,))
+        return cls((*first, layer), (lstm[0], lstm[1], lstm[2]))
+
+
+_LSTM = ("lstm/from_inputs", "lstm/from_before", "lstm/bias")  # in a file
+
+
+def _sigmoid(values: Float32Array) -> Float32Array:
+    """By tanh, which can't overflow."""
+    half = np.float32(0.5)
+    return half * np.tanh(half * values) + half
+
+
+NETWORKS: Mapping[str, type[Network]] = {each.kind: each for each in (Mlp, Attention, Recurrent)}
 """Networks by kind."""
 
 

@@ -46,7 +46,7 @@ def begin_from(source: str, model: BaseAlgorithm, new: LearnedPolicy, env: EnvDe
             load_actor(model, policy.networks)
             return
         restore_networks(model, read_checkpoint(folder / CHECKPOINT)["model"])
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, OSError, RuntimeError) as error:
         raise ValueError(f"can't begin from {source}: {error}") from error
 
 
@@ -56,5 +56,7 @@ def _difference(old: LearnedPolicy, new: LearnedPolicy) -> str:
         pair = [policy.about.get(name, "mlp" if name == "policy" else None) or False for policy in (old, new)]
         if pair[0] != pair[1]:
             return f"it was trained with {name} = {pair[0]!r}, and this run has {name} = {pair[1]!r}"
+    if len({network.kind for policy in (old, new) for network in policy.networks.values()}) > 1:
+        return "it holds networks of another kind than it says"
     kinds = [" and ".join(sorted(policy.networks)) for policy in (old, new)]
     return "" if kinds[0] == kinds[1] else f"its networks are for agents of type {kinds[0]}, and here for {kinds[1]}"

@@ -17,6 +17,7 @@ from agents.learning.scaling import RATE, ObservationScaler
 from agents.learning.slots import SlotScaler, one_slot
 from agents.policy import EnvDescription, Observations, Policy, require_description, require_reset
 from khop_env.env.layout import Float32Array
+from khop_env.observers import IntArray
 
 PRETRAINED = Path(__file__).with_name("pretrained")
 """Folder of the policies that come with the library."""
@@ -31,8 +32,8 @@ class LearnedPolicy:
     What was trained on top of a script (`about["residual"]`) adds its outputs to the script's actions, and clips the
     sum to [-1, 1]; the script may remember more and draw random numbers.
 
-    If episodes of a batch end at different times, as with autoreset, the first rates of change after an end span both
-    episodes; `reset` drops what it remembers.
+    `reset` drops what it remembers. Where episodes of a batch end at different times, as with autoreset, `begin` does
+    so for those that are over; `evaluate` and the commands have no need of it.
 
     Attributes:
         environment: name of the environment it was trained for.
@@ -120,6 +121,8 @@ class LearnedPolicy:
                 f"the batch of observations changed from {before.shape[1:-1]} to {stacked.shape[1:-1]}: call reset() "
                 "first"
             )
+        if before is not None:
+            before = np.where(np.isnan(before), stacked, before)  # of a new episode: no change yet
         features = self.scaler(stacked, before)
         self._before = stacked
         if not self._types and (self._script is not None or "" not in self.networks):
@@ -135,6 +138,31 @@ class LearnedPolicy:
             agent: np.clip(output + script[agent] if script else output, -1.0, 1.0)
             for agent, output in zip(observations, outputs, strict=True)
         }
+
+    def begin(self, batch: int, env_ids: IntArray | None = None) -> None:
+        """New episodes have begun in these of `batch` environments; None for all: nothing is remembered of them."""
+        if env_ids is None or self._before is None:
+            self._before, self._memories = None, {}
+        else:
+            self._before = _filled(self._before, batch, env_ids, np.nan)
+            for whose, memory in self._memories.items():
+                self._memories[whose] = memory and tuple(_filled(each, batch, env_ids, 0.0) for each in memory)
+        script: Any = self._script
+        if hasattr(script, "begin"):
+            script.begin(batch, env_ids)
+
+    def get_state(self) -> dict[str, Any]:
+        """What it remembers between actions."""
+        script: Any = self._script
+        remembered = script.get_state() if hasattr(script, "get_state") else None
+        return {"before": self._before, "memories": dict(self._memories), "script": remembered}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `get_state()`'s result, after a reset in the same environment."""
+        self._before, self._memories = state["before"], dict(state["memories"])
+        script: Any = self._script
+        if hasattr(script, "set_state"):
+            script.set_state(state["script"])
 
     def _columns(self, env: EnvDescription) -> tuple[str, ...]:
         return columns_of(env, isinstance(self.scaler, SlotScaler))
@@ -226,6 +254,13 @@ def pretrained_name(environment: str, scenario: str) -> str:
 
 def _shipped() -> str:
     return ", ".join(sorted(path.stem.replace("@", " on ") for path in PRETRAINED.glob("*.npz"))) or "none"
+
+
+def _filled(memory: Float32Array, batch: int, env_ids: IntArray, value: float) -> Float32Array:
+    """A copy of (..., width), of which the last axes before the width are the batch, with a value in some of it."""
+    rows = memory.reshape(-1, batch, memory.shape[-1]).copy()
+    rows[:, env_ids] = value
+    return rows.reshape(memory.shape)
 
 
 def columns_of(env: EnvDescription, by_slot: bool = False) -> tuple[str, ...]:

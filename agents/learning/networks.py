@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,11 +17,12 @@ from torch import nn
 
 from agents.learning.attention import SlotAttention
 from agents.learning.config import TrainingConfig
-from agents.learning.forward import Attention, Layers, Mlp, Network
+from agents.learning.forward import Attention, Layers, Mlp, Network, Recurrent
 from agents.learning.learned import LearnedPolicy
 from agents.learning.scaling import ObservationScaler
 from agents.learning.slots import SlotScaler
 from agents.learning.state_critic import BesideState, StateCriticPolicy, StateCriticSACPolicy
+from khop_env.extras import how_to_install
 
 REPLAY = 400_000  # agent-steps that SAC learns from, the last ones
 
@@ -110,6 +112,16 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
     return model
 
 
+def require_recurrent(config: TrainingConfig) -> None:
+    """Refuse to train a recurrent policy without sb3-contrib.
+
+    Raises:
+        ModuleNotFoundError: with what to install.
+    """
+    if config.policy == "recurrent" and importlib.util.find_spec("sb3_contrib") is None:
+        raise ModuleNotFoundError(f"recurrent policies are trained with sb3_contrib: {how_to_install('rl')}")
+
+
 def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
     common: dict[str, Any] = {"seed": config.seed, "gamma": config.gamma, "tensorboard_log": log, "device": "cpu"}
     net: dict[str, Any] = {"activation_fn": nn.ReLU, **_extractor(config, env)}
@@ -130,14 +142,21 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
     net["log_std_init"] = config.log_std
     if sees_state:
         net["state"] = net["features_extractor_kwargs"]["state"]
-    if config.per_type:
-        policy: Any = PerTypePolicy
+    algorithm: Any = PPO
+    policy: Any
+    if config.policy == "recurrent":
+        from agents.learning.recurrent import RecurrentPolicy, RecurrentPPO
+
+        algorithm, policy = RecurrentPPO, RecurrentPolicy
+        net["hidden"] = list(config.hidden)
+    elif config.per_type:
+        policy = PerTypePolicy
         net |= {"types": list(types), "hidden": list(config.hidden)}
     else:
         policy = StateCriticPolicy if sees_state else "MlpPolicy"
         net["net_arch"] = {"pi": list(config.hidden), "vf": list(config.hidden)}
     rate = config.learning_rate
-    return PPO(
+    return algorithm(
         policy,
         env,
         learning_rate=LinearlyTo0(rate),
@@ -202,6 +221,10 @@ def actor_networks(model: BaseAlgorithm, types: Sequence[str]) -> dict[str, Netw
         types: names of the agent types, in the order of the one-hot.
     """
     policy: Any = model.policy
+    if hasattr(policy, "lstm_actor"):
+        from agents.learning.recurrent import actor_network
+
+        return {"": actor_network(model)}
     if isinstance(model, SAC) or not isinstance(policy.mlp_extractor, PerTypeExtractor):
         extractor, layers = _actor(model)
         if isinstance(extractor, SlotAttention):
@@ -227,10 +250,16 @@ def load_actor(model: BaseAlgorithm, networks: Mapping[str, Network]) -> None:
     """
     if "" not in networks:
         raise ValueError("a policy's file with a network for each type isn't enough: name the folder of its run")
+    network = networks[""]
+    if isinstance(network, Recurrent):
+        from agents.learning.recurrent import load_actor_network
+
+        load_actor_network(model, network)
+        return
     extractor, layers = _actor(model)
     parameters = [*extractor.parameters(), *(each for layer in layers for each in layer.parameters())]
     with torch.no_grad():
-        for parameter, array in zip(parameters, networks[""].arrays().values(), strict=True):  # in the same order
+        for parameter, array in zip(parameters, network.arrays().values(), strict=True):  # in the same order
             if parameter.shape != array.shape:
                 raise ValueError(f"its layers have shapes as {array.shape}, and here {tuple(parameter.shape)}")
             parameter.copy_(torch.as_tensor(array))

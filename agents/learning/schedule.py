@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import torch
-from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.learning.config import TrainingConfig
@@ -24,7 +24,7 @@ def follow_schedule(model: BaseAlgorithm, env: VecNormalize, config: TrainingCon
     """
     if config.reward_memory:
         env.ret_rms.count = min(env.ret_rms.count, config.reward_memory)
-    if config.log_std_end > config.log_std or not isinstance(model, PPO):
+    if config.log_std_end > config.log_std or not isinstance(model, OnPolicyAlgorithm):
         return
     left = min(1.0, max(0.0, 1.0 - model.num_timesteps / config.timesteps) / (1.0 - config.explore))
     limit = config.log_std_end + left * (config.log_std - config.log_std_end)

@@ -27,7 +27,7 @@ from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.initial import begin_from
 from agents.learning.interrupts import Interrupts
 from agents.learning.learned import LearnedPolicy, columns_of
-from agents.learning.networks import exported, make_model
+from agents.learning.networks import exported, make_model, require_recurrent
 from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
 from agents.learning.run_state import FAULTS, restore_run, run_state
 from agents.learning.schedule import follow_schedule
@@ -85,10 +85,12 @@ def train(
         FileNotFoundError: if `resume` is set and there is no checkpoint.
         FileExistsError: if the folder holds a run and `resume` isn't set, or another training is running there.
         CheckpointError: if the checkpoint can't be read.
+        ModuleNotFoundError: for a recurrent policy without sb3-contrib.
         ValueError: if environment or scenario is unknown, or a resumed run had other settings or another environment.
     """
     torch.set_num_threads(1)  # small networks don't gain from more
     folder = None if out is None else Path(out)
+    require_recurrent(config)
     own = OwnCallbacks(callbacks)
     asked, config = config, dataclasses.replace(config, scenario=chosen_scenario(config.environment, config.scenario))
     if folder is None or not (folder / CHECKPOINT).exists():

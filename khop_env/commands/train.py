@@ -166,8 +166,9 @@ def train(
 ) -> None:
     """Train a policy; then play it: khop evaluate ENV --policies ppo:FOLDER.
 
-    Settings that aren't chosen have defaults, of their own for navigation_v0 and for SAC; config.toml in the folder has
-    them all. A policy trained with --shield is played inside the filter: filter:ppo:FOLDER, as the last line says.
+    Settings that aren't chosen have defaults, of their own for some environments, for SAC and for recurrent policies;
+    config.toml in the folder has them all. A policy trained with --shield is played inside the filter:
+    filter:ppo:FOLDER, as the last line says.
 
     Ctrl-C saves the policy and ends, with exit status 130. --resume continues from the last of twenty checkpoints as if
     nothing had happened. With larger --timesteps a finished run continues; if its scenario was edited since, it is
