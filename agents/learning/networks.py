@@ -21,6 +21,7 @@ from agents.learning.learned import LearnedPolicy
 from agents.learning.scaling import ObservationScaler
 from agents.learning.slots import SlotScaler
 from agents.learning.state_critic import BesideState, StateCriticPolicy, StateCriticSACPolicy
+from khop_env.extras import how_to_install
 
 REPLAY = 400_000  # agent-steps that SAC learns from, the last ones
 
@@ -137,7 +138,7 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
         policy = StateCriticPolicy if sees_state else "MlpPolicy"
         net["net_arch"] = {"pi": list(config.hidden), "vf": list(config.hidden)}
     rate = config.learning_rate
-    return PPO(
+    return _ppo(config)(
         policy,
         env,
         learning_rate=LinearlyTo0(rate),
@@ -169,6 +170,21 @@ def _extractor(config: TrainingConfig, env: VecEnv) -> dict[str, Any]:
         found["features_extractor_class"] = BesideState
         found["features_extractor_kwargs"] = {"state": wrapped.state.size, **arguments}
     return found
+
+
+def _ppo(config: TrainingConfig) -> type[PPO]:
+    """PPO with the run's backend.
+
+    Raises:
+        ModuleNotFoundError: if JAX is asked for and isn't installed.
+    """
+    if config.backend == "torch":
+        return PPO
+    try:
+        from agents.learning.jax_ppo import JaxPPO
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"backend 'jax' needs JAX: {how_to_install('jax')}") from error
+    return JaxPPO
 
 
 def _divisor(samples: int, wanted: int) -> int:
