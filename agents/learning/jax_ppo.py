@@ -18,6 +18,7 @@ from torch import nn
 _LOGGED = ("policy_gradient_loss", "value_loss", "entropy_loss", "clip_fraction", "approx_kl", "loss")
 _BETAS = 0.9, 0.999  # Adam's, as Stable-Baselines3 has them
 _EPS = 1e-5
+_MOMENTS = "exp_avg", "exp_avg_sq"
 
 
 class JaxPPO(PPO):
@@ -48,12 +49,10 @@ class JaxPPO(PPO):
         tensors, structure = jax.tree.flatten(parameters)
         state = policy.optimizer.state
         for tensor in tensors:
-            if not state[tensor]:  # as Adam's first step makes it
+            if not state[tensor]:  # as the first step of torch's Adam makes it
                 state[tensor]["step"] = torch.tensor(0.0)
-                state[tensor]["exp_avg"], state[tensor]["exp_avg_sq"] = (
-                    torch.zeros_like(tensor),
-                    torch.zeros_like(tensor),
-                )
+                for moment in _MOMENTS:
+                    state[tensor][moment] = torch.zeros_like(tensor)
         buffer = self.rollout_buffer
         samples = [
             _flat(values)
@@ -64,7 +63,7 @@ class JaxPPO(PPO):
         steps = float(state[policy.log_std]["step"]) + np.arange(1, len(batches) + 1)
         corrections = np.stack([1 - _BETAS[0] ** steps, np.sqrt(1 - _BETAS[1] ** steps)], axis=1)
         constants = policy.optimizer.param_groups[0]["lr"], clip, self.ent_coef, self.vf_coef, self.max_grad_norm
-        kept = [tensors, *([state[tensor][name] for tensor in tensors] for name in ("exp_avg", "exp_avg_sq"))]
+        kept = [tensors, *([state[tensor][name] for tensor in tensors] for name in _MOMENTS)]
         before = tuple(structure.unflatten([tensor.detach().numpy() for tensor in part]) for part in kept)
         after, logged = _update(
             before, samples, batches.astype(np.int32), corrections.astype(np.float32), np.array(constants, np.float32)
@@ -85,7 +84,7 @@ class JaxPPO(PPO):
         values["loss"] = batches[-1, _LOGGED.index("loss")]
         buffer, policy = self.rollout_buffer, self.policy
         values["explained_variance"] = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        values["std"] = np.exp(policy.log_std.detach().numpy()).mean()  # type: ignore[operator]
+        values["std"] = np.exp(policy.log_std.detach().numpy()).mean()
         for name, value in values.items():
             self.logger.record(f"train/{name}", float(value))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -155,7 +154,7 @@ def _mlp(layers: Any, values: Any) -> Any:
     return values @ weight.T + bias
 
 
-def _layers(hidden: nn.Sequential, head: nn.Linear) -> list[tuple[nn.Parameter, nn.Parameter]]:
+def _layers(hidden: nn.Sequential, head: nn.Linear) -> list[tuple[torch.Tensor, torch.Tensor]]:
     return [(layer.weight, layer.bias) for layer in (*hidden, head) if isinstance(layer, nn.Linear)]
 
 
