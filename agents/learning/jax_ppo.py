@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import explained_variance
 from torch import nn
 
@@ -33,8 +34,10 @@ class JaxPPO(PPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if type(self.policy) is not ActorCriticPolicy or self.policy.activation_fn is not nn.ReLU or self.use_sde:
-            raise ValueError(f"JaxPPO needs an ActorCriticPolicy with ReLU and without gSDE; got {self.policy}")
+        policy: Any = self.policy
+        plain = type(policy) is ActorCriticPolicy and type(policy.features_extractor) is FlattenExtractor
+        if not plain or policy.activation_fn is not nn.ReLU or self.use_sde:
+            raise ValueError(f"JaxPPO needs plain ReLU networks in an ActorCriticPolicy, without gSDE; got {policy}")
 
     def train(self) -> None:
         """Update the policy from the rollout buffer."""

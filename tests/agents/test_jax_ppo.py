@@ -22,7 +22,9 @@ JAX = dataclasses.replace(SMALL, backend="jax")
     [
         ({"backend": "numpy"}, "backend must be 'torch' or 'jax'; got 'numpy'"),
         ({"backend": "jax", "algorithm": "sac"}, "backend 'jax' needs algorithm='ppo'; got 'sac'"),
-        ({"backend": "jax", "per_type": True}, "backend 'jax' needs per_type=False; got True"),
+        ({"backend": "jax", "per_type": True}, "backend 'jax' needs per_type=False; got True: choose it or 'torch'"),
+        ({"backend": "jax", "policy": "attention"}, "backend 'jax' needs policy='mlp'; got 'attention'"),
+        ({"backend": "jax", "critic": "state"}, "backend 'jax' needs critic='local'; got 'state'"),
     ],
 )
 def test_other_combinations_are_refused(changes, said):
