@@ -55,6 +55,7 @@ EXPLANATIONS = (
     ("min_distance_*", "smallest distance of two agents in these; bodies touch at 0.4 m"),
     ("training", "PPO, 64 environments of 8 agents, inside `learn`"),
     ("training_ratio", "the same PPO on MPE2's simple_spread through SuperSuit"),
+    ("training_jax", "that training's agent-steps/s with `backend=jax`, over those with torch, in turns"),
     ("training_environment_share", "share of the environment in that training's time"),
 )
 """Patterns of rows' names, the first that fits, and what is measured."""

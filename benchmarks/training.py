@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import statistics
 import time
 from pathlib import Path
@@ -9,15 +10,17 @@ from typing import Any
 
 from benchmarks.comparison import compare, run_peer
 from benchmarks.report import Report
+from khop_env.extras import how_to_install
 
 TURNS = 3  # repetitions of both sides of the ratio
 
 
-def training_rate(timesteps: int) -> tuple[float, float]:
+def training_rate(timesteps: int, backend: str = "torch") -> tuple[float, float]:
     """PPO on `consensus_v0`, `paper`, 64 environments of 8 agents, with the library's settings.
 
     Args:
         timesteps: agent-steps to train for.
+        backend: what computes updates, "torch" or "jax".
 
     Returns:
         Agent-steps per second inside `learn`, and the environment's share of the wall time: stepping, resetting and
@@ -27,8 +30,9 @@ def training_rate(timesteps: int) -> tuple[float, float]:
     from agents.learning.environment import training_environment
     from agents.learning.networks import make_model
 
-    env: Any = training_environment(TrainingConfig("consensus_v0", timesteps=timesteps))
-    model = make_model(TrainingConfig("consensus_v0", timesteps=timesteps), env, [], None)
+    config = TrainingConfig("consensus_v0", timesteps=timesteps, backend=backend)  # type: ignore[arg-type]
+    env: Any = training_environment(config)
+    model = make_model(config, env, [], None)
     model.learn(1)  # compiles and warms up
     inner = env.venv.venv
     spent, step = 0.0, inner.step_wait
@@ -48,7 +52,7 @@ def training_rate(timesteps: int) -> tuple[float, float]:
 
 
 def training_rows(report: Report, quick: bool, peers: Path | None) -> None:
-    """Measure the throughput, and its ratio to the same PPO on MPE2 if that is installed in `peers`/mpe2.
+    """Measure the throughput, its ratio to the same PPO on MPE2 if that is installed in `peers`/mpe2, and JAX's gain.
 
     Args:
         report: takes the rows.
@@ -74,3 +78,10 @@ def training_rows(report: Report, quick: bool, peers: Path | None) -> None:
         1 if quick else TURNS,
     )
     report.add("training_environment_share", statistics.median(shares), "of the wall time", most=0.3)
+    if importlib.util.find_spec("jax") is None:
+        report.skip("training_jax", f"needs jax: {how_to_install('jax')}")
+        return
+    rates = [
+        [training_rate(timesteps, backend)[0] for backend in ("jax", "torch")] for _ in range(1 if quick else TURNS)
+    ]
+    report.add("training_jax", statistics.median(ours / theirs for ours, theirs in rates), "x torch")

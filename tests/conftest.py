@@ -34,6 +34,7 @@ SLOW = tuple(
         # trainings
         "agents/test_evaluation.py::test_a_model_of_stable_baselines_plays",
         "agents/test_initial.py",
+        "agents/test_jax_ppo.py",
         "agents/test_learned_policies.py",
         "agents/test_learning.py",
         "agents/test_recurrent.py",

@@ -21,6 +21,8 @@ ALGORITHMS = ("ppo", "sac")
 """Algorithms of `khop train`."""
 PolicyNetwork = Literal["mlp", "attention", "recurrent"]
 Critic = Literal["local", "state"]
+Backend = Literal["torch", "jax"]
+_FOR_JAX: Mapping[str, Any] = {"algorithm": "ppo", "policy": "mlp", "per_type": False, "critic": "local"}
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
@@ -71,6 +73,8 @@ class TrainingConfig:
         algorithm: learning algorithm, "ppo" or "sac".
         policy: kind of network: "mlp", "attention" over the slots, whose order and number then don't matter, or
             "recurrent", with memory.
+        backend: what computes PPO's updates: "torch", or "jax", the same in less time but for rounding; for one network
+            of all agents. Episodes and exploration are torch's with both.
         per_type: a network for each type of agent instead of one for all.
         critic: what the value function sees: "local", an agent's features as its policy does, or "state", the true
             global state beside these. Policies that are saved have none.
@@ -114,6 +118,7 @@ class TrainingConfig:
     initial: str | None = None
     algorithm: Algorithm = "ppo"
     policy: PolicyNetwork = "mlp"
+    backend: Backend = "torch"
     per_type: bool = False
     critic: Critic = "local"
     timesteps: int = 2_000_000
@@ -177,6 +182,13 @@ class TrainingConfig:
                 Network.of(self.evaluate_network)
             except ValueError as error:
                 raise ValueError(f"evaluate_network: {error}") from None
+        if self.backend not in get_args(Backend):
+            raise ValueError(f"backend must be 'torch' or 'jax'; got {self.backend!r}")
+        for name, value in _FOR_JAX.items():
+            if self.backend == "jax" and getattr(self, name) != value:
+                raise ValueError(
+                    f"backend 'jax' needs {name}={value!r}; got {getattr(self, name)!r}: choose it or 'torch'"
+                )
         if self.per_type and self.algorithm == "sac":
             raise ValueError("per_type is for 'ppo'; 'sac' trains one network for all agents")
         for name in ("timesteps", "num_envs", "n_steps", "batch_size", "n_epochs", "evaluations"):

@@ -142,7 +142,7 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
     net["log_std_init"] = config.log_std
     if sees_state:
         net["state"] = net["features_extractor_kwargs"]["state"]
-    algorithm: Any = PPO
+    algorithm: Any = _ppo(config)
     policy: Any
     if config.policy == "recurrent":
         from agents.learning.recurrent import RecurrentPolicy, RecurrentPPO
@@ -188,6 +188,21 @@ def _extractor(config: TrainingConfig, env: VecEnv) -> dict[str, Any]:
         found["features_extractor_class"] = BesideState
         found["features_extractor_kwargs"] = {"state": wrapped.state.size, **arguments}
     return found
+
+
+def _ppo(config: TrainingConfig) -> type[PPO]:
+    """PPO with the run's backend.
+
+    Raises:
+        ModuleNotFoundError: if JAX is asked for and isn't installed.
+    """
+    if config.backend == "torch":
+        return PPO
+    try:
+        from agents.learning.jax_ppo import JaxPPO
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"backend 'jax' needs JAX: {how_to_install('jax')}") from error
+    return JaxPPO
 
 
 def _divisor(samples: int, wanted: int) -> int:

@@ -64,6 +64,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "reward_memory": 0,
         "evaluate_network": None,
         "critic": "local",
+        "backend": "torch",
         **stored,
     }  # of earlier versions
     differs = [key for key in current if stored.get(key) != current[key]]
