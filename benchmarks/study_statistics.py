@@ -39,9 +39,9 @@ def iqm95(values: FloatArray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def short(value: float) -> str:
-    """A number with two digits, or all those before the point."""
-    return f"{value:.0f}" if abs(value) >= 10.0 else f"{value:.2g}"
+def short(value: float, digits: int = 2) -> str:
+    """A number with so many digits, or all those before the point."""
+    return f"{value:.0f}" if abs(value) >= 10.0 ** (digits - 1) else f"{value:.{digits}g}"
 
 
 def _middle(ordered: FloatArray) -> FloatArray:
@@ -96,9 +96,9 @@ class Difference:
         return "level" if abs(self.percent) + self.half < LEVEL else "no clear difference"
 
     def __str__(self) -> str:
-        over_seeds = "" if self.over_seeds is None else f", ± {self.over_seeds:.2g} over training seeds"
-        intervals = f"± {self.over_episodes:.2g} over episodes{over_seeds}"
-        return f"{self.mean:+.3g} {intervals} ({self.relative}): {self.word}"
+        over_seeds = "" if self.over_seeds is None else f", ± {short(self.over_seeds)} over training seeds"
+        intervals = f"± {short(self.over_episodes)} over episodes{over_seeds}"
+        return f"{'+' if self.mean >= 0.0 else ''}{short(self.mean, 3)} {intervals} ({self.relative}): {self.word}"
 
     def _in_percent(self, value: float) -> float:
         return 100.0 * value / abs(self.reference) if self.reference else math.nan

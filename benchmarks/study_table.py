@@ -261,9 +261,9 @@ def _cells(first: str, row: Row, rest: Sequence[str]) -> str:
     over_seeds = interval95(returns.mean(axis=1))
     low, high = iqm95(returns)
     cells = (
-        f"{mean:.4g} ± {over_episodes:.2g}",
-        "" if over_seeds is None else f"± {over_seeds:.2g}",
-        f"{iqm(returns):.4g} [{low:.3g}, {high:.3g}]",
+        f"{short(mean, 4)} ± {short(over_episodes)}",
+        "" if over_seeds is None else f"± {short(over_seeds)}",
+        f"{short(iqm(returns), 4)} [{short(low, 3)}, {short(high, 3)}]",
         *rest,
     )
     return f"| {first} | {seeds} | {' | '.join(cells)} |"
