@@ -157,6 +157,10 @@ class TrainingConfig:
             raise ValueError(f"algorithm must be 'ppo' or 'sac'; got {self.algorithm!r}")
         if self.policy not in get_args(PolicyNetwork):
             raise ValueError(f"policy must be one of {', '.join(get_args(PolicyNetwork))}; got {self.policy!r}")
+        if self.critic not in get_args(Critic):
+            raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
+        if self.critic == "state" and self.policy == "recurrent":
+            raise ValueError("critic 'state' is for policies 'mlp' and 'attention'; policy is 'recurrent'")
         if self.policy == "recurrent":
             raise ValueError("policy 'recurrent' isn't there yet: choose 'mlp' or 'attention'")
         if self.policy == "attention" and (self.per_type or self.nearest):
@@ -164,10 +168,6 @@ class TrainingConfig:
             raise ValueError(
                 f"{name} is for policy 'mlp': attention treats all slots alike, by one network for all agents"
             )
-        if self.critic not in get_args(Critic):
-            raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
-        if self.critic == "state" and self.policy == "recurrent":
-            raise ValueError("critic 'state' is for policies 'mlp' and 'attention'; policy is 'recurrent'")
         if self.observe not in OBSERVE:
             raise ValueError(f"observe must be one of {', '.join(OBSERVE)}; got {self.observe!r}")
         if self.evaluate_network is not None:
