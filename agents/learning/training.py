@@ -23,12 +23,19 @@ from agents.learning.config import TrainingConfig
 from agents.learning.config_file import write_config
 from agents.learning.curve import Evaluation, Evaluator, as_csv
 from agents.learning.environment import TrainingVecEnv, described, training_environment
-from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.initial import begin_from
 from agents.learning.interrupts import Interrupts
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
-from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
+from agents.learning.run_folder import (
+    CHECKPOINT,
+    alone_in,
+    environment_fingerprint,
+    load_checkpoint,
+    require_same_environment,
+    versions,
+    write,
+)
 from agents.learning.run_state import FAULTS, restore_run, run_state
 from agents.learning.schedule import follow_schedule
 
@@ -122,14 +129,9 @@ class _Run(BaseCallback):
         self.env: VecNormalize = training_environment(config)
         self.learner: TrainingVecEnv = self.env.venv  # type: ignore[assignment]
         self.batched = batched = self.learner.batched
-        self.fingerprint = fingerprint(chosen_scenario(config.environment, config.scenario), batched)
-        if script := self.learner.script:
-            self.fingerprint["script"] = script.name  # shipped tuned parameters may change
-        if saved is not None and (text := differences(saved["fingerprint"], self.fingerprint)):
-            raise ValueError(
-                f"{folder} holds a run in another environment: {text}; resume it with the unchanged scenario, or "
-                "train in another folder"
-            )
+        self.fingerprint = environment_fingerprint(config, batched, self.learner.script)
+        if saved is not None and folder is not None:
+            require_same_environment(folder, saved, self.fingerprint)
         self.evaluator, self.interrupts = Evaluator(config), Interrupts()
         self.description = described(batched, config)
         self.types = list(dict.fromkeys(model.type for model in batched.fleet.models))
@@ -183,7 +185,7 @@ class _Run(BaseCallback):
 
     def _keep(self) -> None:
         """Save the policy of a training that doesn't come to its end."""
-        if self.folder is None:
+        if self.folder is None or not (self.folder / CHECKPOINT).exists():  # it hadn't begun
             return
         self._exported().save(self.folder / "last.npz")
         if not (self.folder / "best.npz").exists():
