@@ -103,6 +103,11 @@ def run_sweep(
                     if each.status == "interrupted":
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
+            for run in tasks:  # those in other processes, or after a second Ctrl-C
+                if results[run.name].status == "not begun" and (folder / run.name / CHECKPOINT).exists():
+                    saved = load_checkpoint(folder / run.name, _loaded(run.config))
+                    results[run.name] = RunResult.saved(run, folder, saved)
+            result.write()
             raise Interrupted(result) from None
     return result
 

@@ -21,7 +21,7 @@ from agents.learning.callbacks import EndedError, OwnCallbacks
 from agents.learning.checkpoint import CheckpointError, model_state, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
 from agents.learning.config_file import write_config
-from agents.learning.curve import Evaluation, Evaluator, as_csv
+from agents.learning.curve import Evaluation, Evaluator, as_csv, record_evaluation
 from agents.learning.environment import TrainingVecEnv, described, training_environment
 from agents.learning.initial import begin_from
 from agents.learning.interrupts import Interrupts
@@ -221,8 +221,7 @@ class _Run(BaseCallback):
         policy = self._exported()
         found = self.evaluator(self.interrupts.stoppable(policy), self.algorithm.num_timesteps)
         self.curve.append(found)
-        self.algorithm.logger.record("eval/mean_return", found.mean_return)
-        self.algorithm.logger.record("eval/final_task_error", found.final_task_error)
+        record_evaluation(self.algorithm.logger, found)
         if found.mean_return > self.best:
             self.best, self.policy = found.mean_return, policy
             if self.folder is not None:

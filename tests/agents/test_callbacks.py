@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents.learning import LearnedPolicy, TrainingConfig, train
 from agents.learning.archive import read_arrays
@@ -79,6 +80,19 @@ def test_they_are_called_as_stable_baselines3_does_and_change_nothing(whole, tmp
     assert training.curve == whole[0].curve
     assert same_checkpoint(tmp_path, whole[1])
     assert train(TINY, callbacks=Calls()).curve == training.curve  # a single one, and in memory
+
+
+def test_tensorboard_has_every_evaluation_and_update_at_its_step(whole):
+    training, folder = whole
+    logged = EventAccumulator(str(folder / "tensorboard" / "run_1"))
+    logged.Reload()
+    points = {name: [(each.step, each.value) for each in logged.Scalars(name)] for name in logged.Tags()["scalars"]}
+    for name in ("mean_return", "final_task_error"):
+        assert points[f"eval/{name}"] == [
+            (point.timesteps, pytest.approx(getattr(point, name))) for point in training.curve
+        ]
+    for name in ("std", "loss", "value_loss", "entropy_loss", "learning_rate"):
+        assert [step for step, _ in points[f"train/{name}"]][-1] == 4 * ROLLOUT
 
 
 def test_false_ends_it_in_order_and_resumed_it_goes_on_as_if_nothing_had_happened(whole, tmp_path):
