@@ -27,6 +27,7 @@ from agents.learning.sweep_results import RunResult, Status, SweepResult
 from agents.learning.training import train
 from agents.workers import Interrupted, WorkerError, run_in_processes
 from khop_env.objects import described as error_in_words
+from khop_env.objects import load_object
 
 _ENVIRONMENT = ("scenario", "observe", "bounds", "shield", "residual", "evaluate_network", "arguments")
 
@@ -71,7 +72,8 @@ def run_sweep(
     """
     folder, runs = Path(out).resolve(), sweep.runs()
     fingerprints = _checked(runs)
-    named_callbacks(callbacks)
+    for name in callbacks:
+        load_object(name)  # each training makes its own
     begun = [run for run in runs if (folder / run.name / CHECKPOINT).exists()]
     if begun and not resume:
         raise FileExistsError(

@@ -24,7 +24,7 @@ from agents.learning.config_file import write_config
 from agents.learning.curve import Evaluation, Evaluator, as_csv, record_evaluation
 from agents.learning.environment import TrainingVecEnv, described, training_environment
 from agents.learning.initial import begin_from
-from agents.learning.interrupts import Interrupts
+from agents.learning.interrupts import Interrupts, StopError
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model
 from agents.learning.run_folder import (
@@ -163,10 +163,6 @@ class _Run(BaseCallback):
             try:
                 with self.interrupts.caught():
                     self._learn(self.config.timesteps - done)
-                    self.interrupts.check()
-                    self._evaluate()
-                    self._save()
-                    self.algorithm.logger.dump(self.algorithm.num_timesteps)  # what the last update recorded
             except BaseException:
                 self._keep()
                 raise
@@ -177,11 +173,15 @@ class _Run(BaseCallback):
 
     def _learn(self, timesteps: int) -> None:
         """Train for so many more agent-steps, or until a callback of the user's ends it."""
-        callbacks = CallbackList([self, self.own])
+        callbacks, resumed = CallbackList([self, self.own]), self.resumed
         try:
-            self.algorithm.learn(timesteps, callback=callbacks, reset_num_timesteps=not self.resumed, tb_log_name="run")
-        except EndedError:
-            callbacks.on_training_end()
+            try:
+                self.algorithm.learn(timesteps, callback=callbacks, reset_num_timesteps=not resumed, tb_log_name="run")
+            except EndedError:
+                callbacks.on_training_end()
+        except StopError:
+            self.own.on_training_end()
+            raise
 
     def _keep(self) -> None:
         """Save the policy of a training that doesn't come to its end."""
@@ -201,6 +201,14 @@ class _Run(BaseCallback):
         if self.learner.script and not self.algorithm.num_timesteps:
             self._evaluate()  # the script, so that the best policy isn't worse
             self._save()
+
+    def _on_training_end(self) -> None:
+        """Evaluate and save, before the user's callbacks end."""
+        if self.interrupts.interrupted:
+            return
+        self.algorithm.logger.dump(self.algorithm.num_timesteps)  # what the last update recorded
+        self._evaluate()
+        self._save()
 
     def _on_step(self) -> bool:
         return not self.interrupts.interrupted

@@ -116,7 +116,7 @@ def test_the_command_and_its_resumption(folder, whole):
     out = folder / "runs" / "sweeps" / "grid"
     said = refused("train", "--sweep", "grid.toml", "--set", "gamma=0.9")
     assert "holds 4 of these trainings; continue them with --resume, or choose another folder" in said
-    assert "gamma = 0.9 there and 0.95 here; resume with the same" in refused(
+    assert "learning_rate_0.001-seed_0 holds a run with other settings: gamma = 0.9 there and" in refused(
         "train", "--sweep", "grid.toml", "--resume"
     )
     before = {path: path.stat().st_mtime_ns for path in out.glob(f"*/{CHECKPOINT}")}
