@@ -63,8 +63,8 @@ packages_pufferlib = -e . pufferlib-core==3.0.3 gymnasium==1.4.0 pettingzoo==1.2
 runs_pufferlib = integrations/run_pufferlib.py
 needs_pufferlib = 0.6 GB, 1 minute
 
-packages_rllib = -e '.[ray]' 'ray[rllib]==2.60.0' gymnasium==1.2.2 pettingzoo==1.27.0 torch
-runs_rllib = integrations/run_rllib.py integrations/run_evaluation_on_ray.py \
+packages_rllib = -e '.[ray,rl]' 'ray[rllib]==2.60.0' gymnasium==1.2.2 pettingzoo==1.27.0 torch
+runs_rllib = integrations/run_rllib.py integrations/run_evaluation_on_ray.py integrations/run_sweep_on_ray.py \
 	learning/train_rllib.py,--iterations,2 learning/train_rllib.py,--iterations,2,--per-type
 needs_rllib = 2.2 GB, 8 minutes
 

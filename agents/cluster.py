@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from agents.workers import WorkerError
 from khop_env.extras import how_to_install
 
 
@@ -21,6 +22,7 @@ def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator
 
     Raises:
         ModuleNotFoundError: if Ray isn't installed.
+        WorkerError: if a task is lost for good.
         ValueError: if `function` raises it for a task.
     """
     try:
@@ -38,10 +40,16 @@ def run_on_ray(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator
         while waiting:
             ready, _ = ray.wait(list(waiting))
             for reference in ready:
+                number = waiting.pop(reference)
                 try:
-                    yield waiting.pop(reference), ray.get(reference)
+                    result = ray.get(reference)
                 except ray.exceptions.RayTaskError as error:
                     raise error.cause from None
+                except ray.exceptions.RayError as error:
+                    lost = WorkerError(f"a task on the cluster was lost: {error}")
+                    lost.task = number
+                    raise lost from error
+                yield number, result
     finally:
         for reference in waiting:  # after an error or Ctrl-C
             ray.cancel(reference, force=True)

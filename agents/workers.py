@@ -15,7 +15,13 @@ from khop_env.own_agents import call_pickled
 
 
 class WorkerError(RuntimeError):
-    """A worker process ended before its task was finished."""
+    """A worker ended before its task was finished.
+
+    Attributes:
+        task: the task's index; None if no task had been sent.
+    """
+
+    task: int | None = None
 
 
 class Interrupted(KeyboardInterrupt):
@@ -70,7 +76,12 @@ def run_in_processes(function: Callable[[Any], Any], tasks: Sequence[Any], worke
         running = {connection: _assign(connection, waiting) for connection in pool}
         while busy := [connection for connection, number in running.items() if number is not None]:
             for connection in set(busy).intersection(wait(busy)):
-                number, result = running[connection], _received(connection, pool[connection])
+                number = running[connection]
+                try:
+                    result = _received(connection, pool[connection])
+                except WorkerError as error:
+                    error.task = number
+                    raise
                 running[connection] = _assign(connection, waiting)
                 assert number is not None
                 yield number, result

@@ -32,6 +32,7 @@ SLOW = tuple(
     f"tests/{beginning}"
     for beginning in (
         # trainings
+        "agents/test_callbacks.py",
         "agents/test_evaluation.py::test_a_model_of_stable_baselines_plays",
         "agents/test_initial.py",
         "agents/test_jax_ppo.py",
@@ -41,6 +42,12 @@ SLOW = tuple(
         "agents/test_residual.py",
         "agents/test_resuming.py",
         "agents/test_shielded.py::test_a_resumed_training",
+        "agents/test_sweeps.py::test_a_sweep",
+        "agents/test_sweeps.py::test_ctrl_c",
+        "agents/test_sweeps.py::test_in_processes",
+        "agents/test_sweeps.py::test_one_that_fails",
+        "agents/test_sweeps.py::test_the_command",
+        "agents/test_sweeps.py::test_what_a_callback",
         "agents/test_shielded.py::test_a_training_inside",
         "benchmarks/test_study.py::test_the_command",
         "env/test_integrations.py::TestSuperSuit::test_ppo",

@@ -1,9 +1,10 @@
 """Learning: training of policies on estimates, and the trained policies.
 
-`train`, `Training` and `SlotAttention` are imported when they are first asked for: they need PyTorch and
+`train`, sweeps, their results and `SlotAttention` are imported when they are first asked for: they need PyTorch and
 Stable-Baselines3 (the extra `rl`), which policies that were trained don't.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from agents.learning.config import ALGORITHMS, TrainingConfig
@@ -14,6 +15,9 @@ from agents.learning.slots import SlotScaler
 
 if TYPE_CHECKING:
     from agents.learning.attention import SlotAttention
+    from agents.learning.sweep import run_sweep
+    from agents.learning.sweep_file import Sweep, SweepRun, read_sweep
+    from agents.learning.sweep_results import RunResult, SweepResult
     from agents.learning.training import Training, train
 
 __all__ = [
@@ -23,24 +27,33 @@ __all__ = [
     "ObservationScaler",
     "PolicyFileError",
     "PretrainedPolicy",
+    "RunResult",
     "SlotAttention",
     "SlotScaler",
+    "Sweep",
+    "SweepResult",
+    "SweepRun",
     "Training",
     "TrainingConfig",
     "pretrained_name",
+    "read_sweep",
+    "run_sweep",
     "train",
 ]
+
+_ON_DEMAND = {
+    ("Training", "train"): "training",
+    ("SlotAttention",): "attention",
+    ("run_sweep",): "sweep",
+    ("Sweep", "SweepRun", "read_sweep"): "sweep_file",
+    ("RunResult", "SweepResult"): "sweep_results",
+}
 
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
         """Import what needs PyTorch only then."""
-        if name in ("Training", "train"):
-            from agents.learning import training
-
-            return getattr(training, name)
-        if name == "SlotAttention":
-            from agents.learning.attention import SlotAttention
-
-            return SlotAttention
+        for names, module in _ON_DEMAND.items():
+            if name in names:
+                return getattr(importlib.import_module(f"agents.learning.{module}"), name)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

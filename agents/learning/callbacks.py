@@ -61,8 +61,7 @@ def named_callbacks(names: Iterable[str]) -> list[BaseCallback]:
         ValueError: if there is none of this name, or calling it raises.
     """
     found = []
-    for name in names:
-        loaded = load_object(name)
+    for name, loaded in [(name, load_object(name)) for name in names]:
         made = loaded if isinstance(loaded, BaseCallback) or not callable(loaded) else called(name, loaded)
         if not isinstance(made, BaseCallback):
             raise ValueError(

@@ -62,11 +62,20 @@ def read_config(path: str | Path) -> dict[str, Any]:
         ValueError: naming the file, the setting, its value and what is expected.
         OSError: if it can't be read.
     """
+    return fitting_values(read_toml(path), str(path), setting_types())
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """All that a TOML file holds.
+
+    Raises:
+        ValueError: if it isn't one.
+        OSError: if it can't be read.
+    """
     try:
-        found = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path} isn't a TOML file: {error}") from error
-    return fitting_values(found, str(path), setting_types())
 
 
 def setting_types() -> dict[str, Any]:

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+
 from agents.evaluation import play
 from agents.learning.config import TrainingConfig
 from agents.learning.environment import build
@@ -85,6 +87,19 @@ def evaluation_environment(config: TrainingConfig, num_envs: int) -> BatchedEnv:
                 f"trained on; train and evaluate both over networks, or both without one"
             )
     return env
+
+
+def record_evaluation(logger: Logger, found: Evaluation) -> None:
+    """Write an evaluation to TensorBoard, and leave it in the logger for callbacks.
+
+    The logger itself would write it after the next rollout, as if it had been made then.
+    """
+    values = {"eval/mean_return": found.mean_return, "eval/final_task_error": found.final_task_error}
+    for name, value in values.items():
+        logger.record(name, value, exclude="tensorboard")
+    for output in logger.output_formats:
+        if isinstance(output, TensorBoardOutputFormat):
+            output.write(dict(values), dict.fromkeys(values, ()), found.timesteps)
 
 
 def as_csv(curve: Sequence[Evaluation]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,12 @@ from typing import Any
 import filelock
 
 import khop_env
+from agents.evaluation import chosen_scenario
 from agents.learning.checkpoint import CheckpointError, read_checkpoint
 from agents.learning.config import TrainingConfig
+from agents.learning.fingerprint import differences, fingerprint
+from agents.learning.residual import Script
+from khop_env.env import BatchedEnv
 
 CHECKPOINT = "checkpoint.npz"
 
@@ -74,6 +78,25 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         text = ", ".join(f"{key} = {stored.get(key)!r} there and {current[key]!r} here" for key in differs)
         raise ValueError(f"{folder} holds a run with other settings: {text}; resume with the same settings")
     return saved
+
+
+def environment_fingerprint(config: TrainingConfig, batched: BatchedEnv, script: Script | None) -> dict[str, Any]:
+    """Everything that the numbers of a training's environment depend on."""
+    found = fingerprint(chosen_scenario(config.environment, config.scenario), batched)
+    return found if script is None else {**found, "script": script.name}  # shipped tuned parameters may change
+
+
+def require_same_environment(folder: Path, saved: Mapping[str, Any], current: Mapping[str, Any]) -> None:
+    """Refuse to resume a checkpoint in an environment with another fingerprint.
+
+    Raises:
+        ValueError: if they differ; the message says where.
+    """
+    if text := differences(saved["fingerprint"], current):
+        raise ValueError(
+            f"{folder} holds a run in another environment: {text}; resume it with the unchanged scenario, or "
+            "train in another folder"
+        )
 
 
 def write(path: Path, text: str) -> None:

@@ -21,14 +21,21 @@ from agents.learning.callbacks import EndedError, OwnCallbacks
 from agents.learning.checkpoint import CheckpointError, model_state, restored, write_checkpoint
 from agents.learning.config import TrainingConfig
 from agents.learning.config_file import write_config
-from agents.learning.curve import Evaluation, Evaluator, as_csv
+from agents.learning.curve import Evaluation, Evaluator, as_csv, record_evaluation
 from agents.learning.environment import TrainingVecEnv, described, training_environment
-from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.initial import begin_from
-from agents.learning.interrupts import Interrupts
+from agents.learning.interrupts import Interrupts, StopError
 from agents.learning.learned import LearnedPolicy, columns_of
 from agents.learning.networks import exported, make_model, require_recurrent
-from agents.learning.run_folder import CHECKPOINT, alone_in, load_checkpoint, versions, write
+from agents.learning.run_folder import (
+    CHECKPOINT,
+    alone_in,
+    environment_fingerprint,
+    load_checkpoint,
+    require_same_environment,
+    versions,
+    write,
+)
 from agents.learning.run_state import FAULTS, restore_run, run_state
 from agents.learning.schedule import follow_schedule
 
@@ -124,14 +131,9 @@ class _Run(BaseCallback):
         self.env: VecNormalize = training_environment(config)
         self.learner: TrainingVecEnv = self.env.venv  # type: ignore[assignment]
         self.batched = batched = self.learner.batched
-        self.fingerprint = fingerprint(chosen_scenario(config.environment, config.scenario), batched)
-        if script := self.learner.script:
-            self.fingerprint["script"] = script.name  # shipped tuned parameters may change
-        if saved is not None and (text := differences(saved["fingerprint"], self.fingerprint)):
-            raise ValueError(
-                f"{folder} holds a run in another environment: {text}; resume it with the unchanged scenario, or "
-                "train in another folder"
-            )
+        self.fingerprint = environment_fingerprint(config, batched, self.learner.script)
+        if saved is not None and folder is not None:
+            require_same_environment(folder, saved, self.fingerprint)
         self.evaluator, self.interrupts = Evaluator(config), Interrupts()
         self.description = described(batched, config)
         self.types = list(dict.fromkeys(model.type for model in batched.fleet.models))
@@ -163,10 +165,6 @@ class _Run(BaseCallback):
             try:
                 with self.interrupts.caught():
                     self._learn(self.config.timesteps - done)
-                    self.interrupts.check()
-                    self._evaluate()
-                    self._save()
-                    self.algorithm.logger.dump(self.algorithm.num_timesteps)  # what the last update recorded
             except BaseException:
                 self._keep()
                 raise
@@ -177,15 +175,19 @@ class _Run(BaseCallback):
 
     def _learn(self, timesteps: int) -> None:
         """Train for so many more agent-steps, or until a callback of the user's ends it."""
-        callbacks = CallbackList([self, self.own])
+        callbacks, resumed = CallbackList([self, self.own]), self.resumed
         try:
-            self.algorithm.learn(timesteps, callback=callbacks, reset_num_timesteps=not self.resumed, tb_log_name="run")
-        except EndedError:
-            callbacks.on_training_end()
+            try:
+                self.algorithm.learn(timesteps, callback=callbacks, reset_num_timesteps=not resumed, tb_log_name="run")
+            except EndedError:
+                callbacks.on_training_end()
+        except StopError:
+            self.own.on_training_end()
+            raise
 
     def _keep(self) -> None:
         """Save the policy of a training that doesn't come to its end."""
-        if self.folder is None:
+        if self.folder is None or not (self.folder / CHECKPOINT).exists():  # it hadn't begun
             return
         self._exported().save(self.folder / "last.npz")
         if not (self.folder / "best.npz").exists():
@@ -201,6 +203,14 @@ class _Run(BaseCallback):
         if self.learner.script and not self.algorithm.num_timesteps:
             self._evaluate()  # the script, so that the best policy isn't worse
             self._save()
+
+    def _on_training_end(self) -> None:
+        """Evaluate and save, before the user's callbacks end."""
+        if self.interrupts.interrupted:
+            return
+        self.algorithm.logger.dump(self.algorithm.num_timesteps)  # what the last update recorded
+        self._evaluate()
+        self._save()
 
     def _on_step(self) -> bool:
         return not self.interrupts.interrupted
@@ -221,8 +231,7 @@ class _Run(BaseCallback):
         policy = self._exported()
         found = self.evaluator(self.interrupts.stoppable(policy), self.algorithm.num_timesteps)
         self.curve.append(found)
-        self.algorithm.logger.record("eval/mean_return", found.mean_return)
-        self.algorithm.logger.record("eval/final_task_error", found.final_task_error)
+        record_evaluation(self.algorithm.logger, found)
         if found.mean_return > self.best:
             self.best, self.policy = found.mean_return, policy
             if self.folder is not None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import json
-import shlex
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from khop_env.commands import sweeping
 from khop_env.commands.common import (
     INTERRUPTED,
     EnvironmentScenario,
@@ -20,18 +18,14 @@ from khop_env.commands.common import (
     JsonOption,
     NetworkOption,
     ObserveOption,
-    load,
     mistakes,
     print_json,
-    shielded_name,
-    with_network,
 )
-from khop_env.commands.folders import folder_name
+from khop_env.commands.training import default_folder, play_command, settings_of, sweep_of
 from khop_env.extras import how_to_install
 from khop_env.terminal import Progress, print_text, say, waiting
 
 if TYPE_CHECKING:
-    from agents.learning import TrainingConfig
     from agents.learning.curve import Evaluation
 
 
@@ -151,7 +145,10 @@ def train(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder; by default in runs/train/, named after environment, algorithm and seed."),
+        typer.Option(
+            help="Folder; by default in runs/train/, named after environment, algorithm and seed; of a sweep in "
+            "runs/sweeps/, named after its file."
+        ),
     ] = None,
     callback: Annotated[
         list[str] | None,
@@ -161,6 +158,18 @@ def train(
             help="A Stable-Baselines3 callback of your own: my_file.py:MyCallback or my_module:MyCallback; repeatable.",
         ),
     ] = None,
+    sweep: Annotated[
+        Path | None,
+        typer.Option(
+            "--sweep",
+            metavar="GRID.toml",
+            help="Train with all combinations of values in a file, and compare them: settings as in a --config file, "
+            "seeds = [0, 1, 2], and a table [grid] of lists, learning_rate = [1e-3, 2e-3]. Options win over the "
+            "file's settings.",
+        ),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="With --sweep: trainings at once.")] = 1,
+    ray: Annotated[bool, typer.Option("--ray", help="With --sweep: train on a Ray cluster.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Continue from the folder's last checkpoint.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -173,6 +182,9 @@ def train(
     Ctrl-C saves the policy and ends, with exit status 130. --resume continues from the last of twenty checkpoints as if
     nothing had happened. With larger --timesteps a finished run continues; if its scenario was edited since, it is
     refused.
+
+    --sweep trains with many settings. --resume then leaves out trainings that are finished. If one fails, the others go
+    on, and the exit status is 2.
     """
     options = {
         "environment": environment,
@@ -196,18 +208,30 @@ def train(
             from agents.learning.training import train
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(f"training needs {error.name}: {how_to_install('rl')}") from error
+        from agents.learning import TrainingConfig
         from agents.learning.callbacks import named_callbacks
+        from agents.learning.config_file import read_config
         from agents.learning.curve import evaluation_environment
         from agents.learning.environment import build, described
 
+        if sweep is None and (ray or workers > 1):
+            raise ValueError("--workers and --ray are for sweeps (--sweep): one training runs in one process")
         set_by_options = {name: value for name, value in options.items() if value is not None}
-        chosen = _chosen(config, settings or [], set_by_options, env or [], (network, estimator))
+        given = settings or [], set_by_options, env or [], (network, estimator)
+        planned = None if sweep is None else sweep_of(sweep, config, given)
+    if sweep is not None and planned is not None:
+        sweeping.run(
+            sweep, planned, out, workers=workers, ray=ray, resume=resume, callbacks=callback or (), as_json=as_json
+        )
+        return
+    with mistakes(), waiting("starting"):
+        chosen = TrainingConfig.suited(**settings_of({} if config is None else read_config(config), config, *given))
         played = described(build(chosen, 1), chosen)  # refuses what doesn't fit before there is a folder
         if chosen.evaluate_network is not None:
             evaluation_environment(chosen, 1)
         callbacks = named_callbacks(callback or ())
         unit = played.error_unit
-        folder = out or Path("runs") / "train" / _folder(chosen, played.environment)
+        folder = out or Path("runs") / "train" / default_folder(chosen, played.environment)
     label = f"training {chosen.environment} on {chosen.observe}"
     with mistakes(), Progress(label) as progress:
 
@@ -241,74 +265,6 @@ def train(
     if not as_json:
         for name, path in files.items():
             typer.echo(f"{name}: {path}")
-        typer.echo(f"play it: {_play(chosen, folder)}")
+        typer.echo(f"play it: {play_command(chosen, folder)}")
     if not training.finished:
         raise typer.Exit(INTERRUPTED)
-
-
-def _chosen(
-    file: Path | None,
-    settings: list[str],
-    options: Mapping[str, Any],
-    env: list[str],
-    over: tuple[str | None, str | None],
-) -> TrainingConfig:
-    """The settings: those of the options, then of --set, then of the file, then the defaults.
-
-    Raises:
-        ValueError: for a wrong file, setting or argument, or no environment.
-    """
-    from agents.learning import TrainingConfig
-    from agents.learning.config_file import read_config, setting_types
-    from khop_env.observers import ESTIMATORS
-    from khop_env.registry import find_task
-    from khop_env.typed import environment_arguments, environment_types, fitting_values, typed_values
-
-    found = {} if file is None else read_config(file)
-    known = {name: kind for name, kind in setting_types().items() if name != "arguments"}
-    found |= {**typed_values(settings, "--set", known), **options}
-    if "environment" not in found:
-        raise ValueError("name an environment to train for, khop train ENV, or a --config file that names it")
-    task = find_task(found["environment"])
-    elsewhere = {"observe": "--observe", "bounds": "--bounds"}
-    arguments = fitting_values(found.get("arguments", {}), f"{file}: arguments", environment_types(task))
-    found["arguments"] = arguments | with_network(environment_arguments(env, task, elsewhere), *over)
-    estimator = found["arguments"].get("estimator")
-    if not isinstance(estimator, str | None):
-        raise ValueError(
-            f"estimator {estimator.name!r}: the configuration of a training is a file, which can't hold an estimator "
-            f"of your own; choose one of {', '.join(ESTIMATORS)}"
-        )
-    if found.get("scenario") is not None:
-        load(found["scenario"])  # refuses one with a law that there isn't, as every command does
-    return TrainingConfig.suited(**found)
-
-
-def _folder(config: TrainingConfig, environment: str) -> str:
-    shield = "" if config.shield is None else f"shield-{config.shield}"
-    residual = "" if config.residual is None else f"residual-{config.residual}"
-    policy = "" if config.policy == "mlp" else config.policy
-    network = "" if config.evaluate_network is None else f"evaluated-{config.evaluate_network}"
-    critic = "state-critic" * (config.critic == "state")
-    extras = network, "bounds" * config.bounds, shield, residual, policy, "per_type" * config.per_type, critic
-    return folder_name(
-        environment, str(config.scenario or ""), config.observe, *extras, f"{config.algorithm}-{config.seed}"
-    )
-
-
-def _play(config: TrainingConfig, folder: Path) -> str:
-    """The command that plays what was trained."""
-    command = ["khop", "evaluate", str(config.environment)]
-    command += ["--scenario", str(config.scenario)] if config.scenario else []
-    arguments = config.as_dict()["arguments"]
-    if config.evaluate_network is not None:
-        arguments["network"] = config.evaluate_network
-    for name, value in arguments.items():
-        if name in ("network", "estimator") and isinstance(value, str):
-            command += [f"--{name}", value]
-            continue
-        command += ["--env", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
-    policy = f"{config.algorithm}:{folder}"
-    if config.shield is not None:
-        policy = shielded_name(policy, str(config.shield))
-    return shlex.join([*command, "--policies", policy])

@@ -1,10 +1,12 @@
 """Callbacks of the user's own in a training: called as Stable-Baselines3 does, beside ours."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents.learning import LearnedPolicy, TrainingConfig, train
 from agents.learning.archive import read_arrays
@@ -52,6 +54,7 @@ class Calls(BaseCallback):
 
     def _on_training_end(self):
         self.calls.append("training_end")
+        self.returns.append(self.logger.name_to_value.get("eval/mean_return"))
 
 
 @pytest.fixture(scope="module")
@@ -75,10 +78,24 @@ def test_they_are_called_as_stable_baselines3_does_and_change_nothing(whole, tmp
     training = train(TINY, tmp_path, callbacks=[own, StopTrainingOnMaxEpisodes(10**6)])
     assert own.calls == ["training_start", *["rollout_start", *["step"] * 4, "rollout_end"] * 4, "training_end"]
     assert own.steps == list(range(24, 4 * ROLLOUT + 1, 24))
-    assert own.returns == [None, None, training.curve[0].mean_return, None]  # readable in the rollout after it
+    first, last = (point.mean_return for point in training.curve)
+    assert own.returns == [None, None, first, None, last]  # readable in the rollout after it, and at the end
     assert training.curve == whole[0].curve
     assert same_checkpoint(tmp_path, whole[1])
     assert train(TINY, callbacks=Calls()).curve == training.curve  # a single one, and in memory
+
+
+def test_tensorboard_has_every_evaluation_and_update_at_its_step(whole):
+    training, folder = whole
+    logged = EventAccumulator(str(folder / "tensorboard" / "run_1"))
+    logged.Reload()
+    points = {name: [(each.step, each.value) for each in logged.Scalars(name)] for name in logged.Tags()["scalars"]}
+    for name in ("mean_return", "final_task_error"):
+        assert points[f"eval/{name}"] == [
+            (point.timesteps, pytest.approx(getattr(point, name))) for point in training.curve
+        ]
+    for name in ("std", "loss", "value_loss", "entropy_loss", "learning_rate"):
+        assert [step for step, _ in points[f"train/{name}"]][-1] == 4 * ROLLOUT
 
 
 def test_false_ends_it_in_order_and_resumed_it_goes_on_as_if_nothing_had_happened(whole, tmp_path):
@@ -102,6 +119,23 @@ def test_false_ends_sac_too(tmp_path):
     training = train(config, tmp_path, callbacks=Calls(at=48, answer=False))
     assert training.finished
     assert [point.timesteps for point in training.curve] == [48]
+
+
+@pytest.mark.parametrize("where", ["_on_step", "_on_rollout_end"])
+def test_ctrl_c_ends_callbacks_too(where, monkeypatch):
+    """In a rollout and in an update."""
+    own = Calls()
+
+    def interrupt(self):
+        if self.num_timesteps == (24 if where == "_on_step" else ROLLOUT):  # a second one would be a KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
+        return True
+
+    monkeypatch.setattr(Calls, where, interrupt)
+    training = train(TINY, callbacks=[own])
+    assert not training.finished
+    assert training.curve == []
+    assert own.calls[-1] == "training_end"
 
 
 def test_an_exception_comes_through_and_nothing_is_lost(whole, tmp_path):
