@@ -19,9 +19,10 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from agents.learning import TrainingConfig
+from agents.learning.config import Backend
 from agents.learning.run_folder import write
 from agents.workers import Interrupted
 from benchmarks.publish import commit
@@ -37,11 +38,11 @@ from benchmarks.study import (
     finished,
     runs,
     state_of,
-    train_all,
 )
 from benchmarks.study_curves import FIGURES, draw, exploration
 from benchmarks.study_measured import EPISODES, Block, measure
 from benchmarks.study_table import largest_ratios, summary, table
+from benchmarks.study_training import train_all
 from khop_env.network import PROFILES, Network
 from khop_env.physics import did_you_mean
 from khop_env.registry import make_batched
@@ -84,7 +85,15 @@ def main(arguments: Sequence[str] | None = None, tasks: Sequence[StudyTask] = TA
     every = [run for run in runs(tasks) if run not in set(chosen)]
     try:
         until = start + 3600.0 * options.hours
-        problems = train_all(chosen, options.root, workers=options.workers, until=until, commit=commit(), say=_say)
+        problems = train_all(
+            chosen,
+            options.root,
+            workers=options.workers,
+            until=until,
+            commit=commit(),
+            backend=options.backend,
+            say=_say,
+        )
         problems += [f"{run.label}: {state.text}" for run in every if (state := state_of(run, options.root)).text]
         blocks, unplayed = measure(options.root, tasks, episodes=options.episodes, workers=options.workers, say=_say)
         problems += unplayed
@@ -113,6 +122,7 @@ def _options(arguments: Sequence[str] | None, tasks: Sequence[StudyTask]) -> arg
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, default=Path("runs/study"), help="folder of the runs")
     parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--backend", choices=get_args(Backend), default="torch", help="of trainings that can have it")
     parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the page and the figures")
     parser.add_argument("--hours", type=float, default=math.inf, help="begin no training after this time")
     parser.add_argument("--only", default="", help="train only these tasks: environments or scenarios, with commas")

@@ -6,17 +6,13 @@ Every run has a folder of its own; finished runs aren't repeated, and one that w
 from __future__ import annotations
 
 import json
-import time
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from agents.learning.config import TrainingConfig
 from agents.learning.config_file import read_config
-from agents.learning.run_folder import CHECKPOINT, write
-from agents.workers import run_in_processes
 from khop_env.simulation import Observe
 
 SEEDS = range(5)
@@ -254,6 +250,7 @@ def state_of(run: Run, root: Path) -> State:
         return State("missing")
     try:
         there = TrainingConfig(**read_config(folder / "config.toml")).as_dict()
+        wanted["backend"] = there["backend"]  # the same results but for rounding
         differs = [f"{key} = {there[key]!r} and not {value!r}" for key, value in wanted.items() if there[key] != value]
     except (TypeError, ValueError) as error:
         differs = [str(error)]
@@ -261,87 +258,3 @@ def state_of(run: Run, root: Path) -> State:
         why = f"{folder} was trained with other settings than today's ({'; '.join(differs)})"
         return State("other", f"{why}: it isn't used; move it away to train it again")
     return State("missing" if finished(folder) is None else "finished")
-
-
-_INTERRUPTED = "interrupted"
-
-
-class _Job(NamedTuple):
-    run: Run
-    root: Path
-    until: float  # no training begins after this time
-    commit: str
-
-
-def train_all(
-    chosen: Sequence[Run],
-    root: Path,
-    *,
-    workers: int = 2,
-    until: float = float("inf"),
-    commit: str = "",
-    say: Callable[[str], None] = print,
-) -> list[str]:
-    """Run the missing trainings.
-
-    Args:
-        chosen: in this order.
-        root: folder of the study.
-        workers: number of processes; 1 for this one.
-        until: time (`time.time()`) after which no training begins.
-        commit: of the code, in words.
-        say: called with a line after every run.
-
-    Returns:
-        A line for every run that failed, can't be trained, or wasn't because its folder has other settings.
-
-    Raises:
-        KeyboardInterrupt: on Ctrl-C; runs that were cut go on from their last evaluation the next time.
-    """
-    states = {run: state_of(run, root) for run in chosen}
-    problems = []
-    for run, state in states.items():
-        if state.text:
-            problems.append(f"{run.label}: {state.text}")
-            say(problems[-1])
-    jobs = [_Job(run, root, until, commit) for run, state in states.items() if state.kind == "missing"]
-    start, trained = time.perf_counter(), 0
-    for number, outcome in in_processes(_train, jobs, workers):
-        if outcome is None:
-            continue
-        good, text = outcome
-        if text == _INTERRUPTED:
-            raise KeyboardInterrupt
-        trained += 1
-        if not good:
-            problems.append(f"{jobs[number].run.label}: {text}")
-        left = (time.perf_counter() - start) / trained * (len(jobs) - trained)
-        say(f"{trained} of {len(jobs)}: {jobs[number].run.label}: {text}; about {left / 60:.0f} min left for all")
-    if len(jobs) > trained:
-        say(f"{len(jobs) - trained} of {len(jobs)} trainings weren't begun: the time is over")
-    return problems
-
-
-def in_processes(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int) -> Iterator[tuple[int, Any]]:
-    """Index and result of each job as they are finished; with one worker in this process."""
-    return run_in_processes(function, jobs, workers) if workers > 1 else enumerate(map(function, jobs))
-
-
-def _train(job: _Job) -> tuple[bool, str] | None:
-    """Whether it went well, and in words what came out; None if it wasn't begun. One failure doesn't end the others."""
-    from agents.learning.training import train
-
-    if time.time() > job.until:
-        return None
-    folder = job.run.folder(job.root)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            training = train(job.run.config(), folder, resume=(folder / CHECKPOINT).exists())
-        except Exception as error:
-            return False, f"failed: {type(error).__name__}: {error}"
-    if not training.finished:
-        return False, _INTERRUPTED
-    write(folder / DONE, json.dumps({"seconds": round(training.seconds, 1), "commit": job.commit}) + "\n")
-    best = max(point.mean_return for point in training.curve)
-    return True, f"{best:.4g} in {training.seconds:.0f} s"

@@ -17,8 +17,9 @@ import khop_env
 from agents.comparison import compare
 from agents.tuned import PATH as TUNED
 from agents.workers import UnfinishedError
-from benchmarks.study import CONTINUOUS, FILTER, NETWORKS, RECIPES, SCRIPTS, SEEDS, Play, Run, StudyTask, in_processes
+from benchmarks.study import CONTINUOUS, FILTER, NETWORKS, RECIPES, SCRIPTS, SEEDS, Play, Run, StudyTask
 from benchmarks.study import state_of as run_state
+from benchmarks.study_training import in_processes
 from khop_env.observers import FloatArray
 from khop_env.simulation import OBSERVE
 
