@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.evaluation import Episodes, chosen_scenario, play, require_seeds
+from agents.learning.pretrained import resolved
 from agents.outcomes import interval95, summary
 from agents.policies import Needs, make_policy, needs
-from agents.policy import EnvDescription, describe, in_words
+from agents.policy import EnvDescription, Policy, describe, in_words
 from agents.workers import Interrupted, UnfinishedError, run_in_processes
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv
 from khop_env.observers import Networked
-from khop_env.registry import Environment, make_batched
+from khop_env.registry import Environment, find_task, make_batched
 from khop_env.results.data_columns import DataColumn
 from khop_env.results.dataset import EpisodeDataset
 from khop_env.results.episodes import EpisodeRecorder, Part
@@ -204,8 +205,7 @@ def compare(
     rows: list[tuple[str, EnvDescription, Needs, str | None]] = []
     # check that each policy fits before the first episode
     for spec, network in itertools.product(policies, networks or (None,)):
-        policy = make_policy(spec)
-        needed = needs(policy)
+        policy, needed = player.policy(spec, network)
         for mode in observe:
             env = describe(player.environment(mode, needed, network))
             rows.append((spec, env, needed, network))
@@ -269,6 +269,17 @@ class _Player:
         self._made: dict[tuple[Observe, Needs, str | None], BatchedEnv] = {}
         self.columns: Mapping[str, DataColumn] | None = None  # of recorded steps; None: nothing is recorded
 
+    def policy(self, spec: str, network: str | None) -> tuple[Policy, Needs]:
+        """A policy by name, and what it needs of the environment.
+
+        Raises:
+            ValueError: if there is no such policy, or none is shipped for the environment.
+        """
+        task = find_task(self._environment)
+        arguments = self._arguments if network is None else {**self._arguments, "network": network}
+        policy = resolved(make_policy(spec), f"{task.name}_v{task.version}", self._scenario, arguments)
+        return policy, needs(policy)
+
     def environment(self, observe: Observe, needed: Needs, network: str | None) -> BatchedEnv:
         """The environment, with num_envs = CHUNK, and what a policy needs unless the arguments say otherwise."""
         if (observe, needed, network) not in self._made:
@@ -288,7 +299,7 @@ class _Player:
 
     def __call__(self, task: _Task) -> _Played:
         spec, observe, needed, network, seeds = task
-        env, policy = self.environment(observe, needed, network), make_policy(spec)
+        env, (policy, _) = self.environment(observe, needed, network), self.policy(spec, network)
         parts: list[Part] = []
         try:
             if self.columns is None:

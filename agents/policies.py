@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, get_type_hints
 
 from agents.laws import LAWS
 from agents.learning.config import ALGORITHMS
-from agents.learning.learned import LearnedPolicy, PretrainedPolicy
+from agents.learning.learned import LearnedPolicy
+from agents.learning.pretrained import PretrainedPolicy, load_pretrained
 from agents.navigation import GoToGoal, KeepRight
 from agents.orca import Orca
 from agents.policy import Policy
@@ -19,7 +20,7 @@ from agents.scripted import BangBangPolicy, LawPolicy, RandomPolicy, ZeroPolicy
 from khop_env.network import Network
 from khop_env.objects import called, is_object_name, load_object
 from khop_env.physics import did_you_mean
-from khop_env.registry import environments, parameters_from_text
+from khop_env.registry import parameters_from_text
 from khop_env.scenarios import Scenario
 
 FLOOR: dict[str, Callable[..., Policy]] = {
@@ -54,8 +55,8 @@ def make_policy(spec: str) -> Policy:
         make_policy("zero")
         make_policy("orca:horizon=1")        # a baseline in navigation_v0, as robust_barrier:alpha=2
         make_policy("ppo:runs/first")        # written by khop train: its folder, or one of the .npz files in it
-        make_policy("ppo:pretrained")        # shipped with the library for some environments and scenarios
-        make_policy("ppo:pretrained/consensus_v0")  # the shipped policy for this environment
+        make_policy("ppo:pretrained")        # the shipped policy for the environment, its scenario and network
+        make_policy("ppo:pretrained/leader_following_convoy")  # a shipped policy by its name (khop list)
         make_policy("my_file.py:MyPolicy")   # your own class or object; also "my_module:MyPolicy"
         make_policy("filter")                # keep_right in a safety filter, with certified bounds
         make_policy("filter:margin=0.3,gamma=0.5:ppo:runs/first")  # any of these, with options of SafetyFilter
@@ -72,16 +73,12 @@ def make_policy(spec: str) -> Policy:
     if name in ALGORITHMS:
         if not argument:
             raise ValueError(f"policy {spec!r}: no policy file named; expected {name}:FOLDER or {name}:pretrained")
-        if argument == "pretrained" or argument.startswith("pretrained/"):
+        if argument == "pretrained":
             if name != "ppo":
-                raise ValueError(f"policy {spec!r}: only ppo:pretrained is shipped")
-            environment = argument.partition("/")[2] or None
-            if environment not in (None, *environments()):
-                raise ValueError(
-                    f"policy {spec!r}: no environment {environment!r}; {did_you_mean(environment, environments())}"
-                )
-            return PretrainedPolicy(environment)
-        policy = LearnedPolicy.load(argument)
+                raise ValueError(f"policy {spec!r}: only ppo:pretrained chooses; others by name, ppo:pretrained/NAME")
+            return PretrainedPolicy()
+        beginning, _, rest = argument.partition("/")
+        policy = load_pretrained(rest) if beginning == "pretrained" else LearnedPolicy.load(argument)
         if policy.about["algorithm"] != name:
             raise ValueError(f"policy {spec!r}: {argument} was trained by {policy.about['algorithm']}")
         return policy

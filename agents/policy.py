@@ -12,8 +12,9 @@ import numpy as np
 from khop_env.brief import brief
 from khop_env.env import BatchedEnv, ObservationLayout
 from khop_env.env.layout import Float32Array
+from khop_env.network import Network
 from khop_env.objects import described
-from khop_env.observers import FloatArray
+from khop_env.observers import FloatArray, Networked
 from khop_env.physics import AgentModel
 from khop_env.simulation import Observe
 from khop_env.tasks import Navigation
@@ -41,6 +42,8 @@ class EnvDescription:
         steps: Euler steps of the simulator in a control period; 0 if it integrates otherwise.
         apart: distance in m from which two acting agents start; None where that isn't known.
         radius: of agents' bodies in m, in navigation and where the scenario has an arena; else None.
+        network: over which agents know of each other; None for exchange in continuous time.
+        estimator: name of the one that makes estimates of its messages; None without a network.
     """
 
     environment: str
@@ -57,6 +60,8 @@ class EnvDescription:
     steps: int = 1
     apart: float | None = None
     radius: float | None = None
+    network: Network | None = None
+    estimator: str | None = None
 
     __repr__ = brief
 
@@ -111,6 +116,7 @@ def describe(env: object) -> EnvDescription:
     arena = None if initial is None else initial.arena
     if isinstance(batched.task, Navigation):  # which has one on every scenario
         arena = batched.task.arena
+    observers = batched.simulator.observers
     pushed = np.zeros(fleet.n) if disturbance is None else disturbance.attach(fleet).bound
     return EnvDescription(
         environment=batched.task.environment,
@@ -126,6 +132,8 @@ def describe(env: object) -> EnvDescription:
         steps=_euler_steps(batched),
         apart=_apart(batched),
         radius=None if arena is None else arena.radius,
+        network=observers.network if isinstance(observers, Networked) else None,
+        estimator=observers.estimator.name if isinstance(observers, Networked) else None,
     )
 
 

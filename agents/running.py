@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.learning.learned import LearnedPolicy, PretrainedPolicy
+from agents.learning.learned import LearnedPolicy
+from agents.learning.pretrained import PretrainedPolicy, environments_of, resolved
 from agents.outcomes import Outcomes
 from agents.policies import make_policy, needs
 from agents.policy import Policy, describe, in_words, policy_seeds
@@ -173,7 +174,8 @@ def policy_and_environment(
     environment = environment_for(spec, scenario) if environment is None else environment
     task = find_task(environment)
     named = f"{task.name}_v{task.version}"
-    about = _training(policy, named, scenario)
+    policy = resolved(policy, named, scenario, chosen)
+    about = _training(policy)
     if about.get("environment") == named:
         chosen = {"bounds": about["bounds"], **about.get("arguments", {}), **chosen}
     chosen |= needs(policy).among(arguments or {}, scenario)
@@ -194,16 +196,24 @@ def environment_for(spec: str, scenario: Scenario) -> str:
 
     Returns:
         What a learned policy was trained for; for others the environment that it is the default policy of, that of the
-        scenario's law, navigation where the scenario has an arena, or consensus.
+        scenario's law, navigation where the scenario has an arena, or consensus. Where policies are shipped for several
+        environments on the scenario, "ppo:pretrained" acts in the one in which others do.
 
     Raises:
-        ValueError: if a learned policy was trained for a task that isn't of the library.
+        ValueError: if a learned policy was trained for a task that isn't of the library, or none is shipped for the
+            scenario.
     """
     of_law = f"{scenario.law.name}_v0"
     of_policy = [name for name in environments() if find_task(name).default_policy == spec.partition(":")[0]]
     of_scenario = "consensus_v0" if scenario.arena is None else "navigation_v0"
     other = of_policy[0] if of_policy else of_law if of_law in environments() else of_scenario
-    found: str = _training(make_policy(spec), None, scenario).get("environment", other)
+    policy = make_policy(spec)
+    if isinstance(_inside(policy), PretrainedPolicy):
+        for_it = environments_of(scenario.name)
+        if other not in for_it and len(for_it) > 1:
+            raise ValueError(f"there are pretrained policies for {' and '.join(for_it)} on {scenario.name}: choose one")
+        return other if other in for_it else for_it[0]
+    found: str = _training(policy).get("environment", other)
     if found not in environments():
         raise ValueError(
             f"{spec} was trained for {found}, which isn't of the library: name its task, as in "
@@ -212,11 +222,12 @@ def environment_for(spec: str, scenario: Scenario) -> str:
     return found
 
 
-def _training(policy: Policy, environment: str | None, scenario: Scenario) -> Mapping[str, Any]:
+def _inside(policy: Policy) -> Policy:
+    """A policy, or the one in its safety filter."""
+    return _inside(policy.policy) if isinstance(policy, SafetyFilter) else policy
+
+
+def _training(policy: Policy) -> Mapping[str, Any]:
     """How a learned policy was trained, in a safety filter or not; nothing of others."""
-    if isinstance(policy, SafetyFilter):
-        return _training(policy.policy, environment, scenario)
-    if isinstance(policy, PretrainedPolicy):
-        policy.environment = policy.environment or environment
-        return policy.about_for(scenario.name)
-    return policy.about if isinstance(policy, LearnedPolicy) else {}
+    inside = _inside(policy)
+    return inside.about if isinstance(inside, LearnedPolicy) else {}

@@ -1,8 +1,9 @@
-"""The films and thumbnails of the environments' pages; needs the extra `render`.
+"""The films and thumbnails of the site; needs the extra `render`.
 
-python docs/films.py [ENV ...]       # writes docs/images/ENV.gif and docs/images/ENV_small.png
+python docs/films.py [ENV ...]             # environments' pages: docs/images/ENV.gif and docs/images/ENV_small.png
+python docs/films.py --gallery [NAME ...]  # docs/images/gallery_NAME.gif and docs/gallery.md
 
-`khop run` makes the film; here it gets fewer pictures and colours, so that it is small enough for a page.
+`khop run` makes the films of environments; here they get fewer pictures and colours, and are small enough for a page.
 """
 
 import argparse
@@ -13,11 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for benchmarks, which aren't installed
+from gallery_films import GALLERY, PAGE, page
+from gallery_films import make as make_gallery
+from gif import shrunk, write_film
+
 IMAGES = Path(__file__).parent / "images"
 MAP = (47, 33, 550, 536)  # the map in a picture, without axes and legend
 THUMBNAIL = 360  # pixels
-COLORS = 64
-HOLD = 1500  # ms for which the last picture stays
 
 
 @dataclass(frozen=True)
@@ -100,23 +104,23 @@ def make(name: str) -> None:
     small = at(film.thumbnail).crop(MAP).resize((THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS)
     small.save(IMAGES / f"{name}_small.png", optimize=True)
     kept = [*map(at, np.arange(0.0, times[-1] - film.step, film.step)), pictures[-1]]
-    typical = np.vstack([np.asarray(kept[number * (len(kept) - 1) // 3]) for number in range(4)])
-    palette = Image.fromarray(typical).quantize(COLORS, Image.Quantize.MEDIANCUT, kmeans=3)
-    first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in kept)
-    path = IMAGES / f"{name}.gif"
-    shown = [film.shown] * len(others) + [HOLD]
-    first.save(path, save_all=True, append_images=others, duration=shown, loop=0, optimize=True)
-    print(f"{path.name}: {len(kept)} pictures, {path.stat().st_size // 1000} kB")
+    write_film(IMAGES / f"{name}.gif", shrunk(kept), film.shown)
 
 
 def main() -> None:
     """Write the films that are asked for, or all."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("names", metavar="ENV", nargs="*", help="by default all environments")
-    for name in parser.parse_args().names or FILMS:
-        if name not in FILMS:
-            parser.error(f"no film of {name!r}; there are {', '.join(FILMS)}")
-        make(name)
+    parser.add_argument("names", metavar="NAME", nargs="*", help="by default all environments, or the whole gallery")
+    parser.add_argument("--gallery", action="store_true", help="films of the gallery, and its page")
+    chosen = parser.parse_args()
+    known = GALLERY if chosen.gallery else FILMS
+    for name in chosen.names:
+        if name not in known:
+            parser.error(f"no film of {name!r}; there are {', '.join(known)}")
+    for name in chosen.names or known:
+        (make_gallery if chosen.gallery else make)(name)
+    if chosen.gallery:
+        PAGE.write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

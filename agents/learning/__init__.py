@@ -8,8 +8,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from agents.learning.config import ALGORITHMS, TrainingConfig
-from agents.learning.learned import PRETRAINED, LearnedPolicy, PretrainedPolicy, pretrained_name
+from agents.learning.learned import LearnedPolicy
 from agents.learning.policy_file import PolicyFileError
+from agents.learning.pretrained import PRETRAINED, PretrainedPolicy, Shipped, load_pretrained, shipped
 from agents.learning.scaling import ObservationScaler
 from agents.learning.slots import SlotScaler
 
@@ -28,6 +29,7 @@ __all__ = [
     "PolicyFileError",
     "PretrainedPolicy",
     "RunResult",
+    "Shipped",
     "SlotAttention",
     "SlotScaler",
     "Sweep",
@@ -35,9 +37,10 @@ __all__ = [
     "SweepRun",
     "Training",
     "TrainingConfig",
-    "pretrained_name",
+    "load_pretrained",
     "read_sweep",
     "run_sweep",
+    "shipped",
     "train",
 ]
 

@@ -15,12 +15,9 @@ from agents.learning.policy_file import PolicyFileError, read_policy, write_poli
 from agents.learning.residual import make_script
 from agents.learning.scaling import RATE, ObservationScaler
 from agents.learning.slots import SlotScaler, one_slot
-from agents.policy import EnvDescription, Observations, Policy, require_description, require_reset
+from agents.policy import EnvDescription, Observations, Policy, require_description
 from khop_env.env.layout import Float32Array
 from khop_env.observers import IntArray
-
-PRETRAINED = Path(__file__).with_name("pretrained")
-"""Folder of the policies that come with the library."""
 
 
 @dataclass(eq=False)
@@ -195,65 +192,6 @@ class LearnedPolicy:
             return cls(**fields)
         except ValueError as error:
             raise PolicyFileError(f"{path} can't be played: {error}") from error
-
-
-class PretrainedPolicy:
-    """The shipped policy for an environment and scenario, loaded at reset, when both are known.
-
-    Args:
-        environment: name of the environment it was trained for; None for the environment at reset.
-    """
-
-    def __init__(self, environment: str | None = None) -> None:
-        self.environment = environment
-
-    def reset(self, env: EnvDescription, seeds: Sequence[int]) -> None:
-        """Load the policy.
-
-        Raises:
-            PolicyFileError: if none is shipped for this environment and scenario, or it doesn't fit.
-        """
-        require_description(env)
-        if self.environment not in (None, env.environment):
-            raise PolicyFileError(f"the policy for {self.environment} doesn't fit {env.environment}")
-        path = PRETRAINED / f"{pretrained_name(env.environment, env.scenario)}.npz"
-        if not path.exists():
-            raise PolicyFileError(
-                f"no pretrained policy for {env.environment} on {env.scenario}; available: {_shipped()}. "
-                f"To train one: khop train {env.environment} --scenario {env.scenario}"
-            )
-        self._policy = LearnedPolicy.load(path)
-        self._policy.reset(env, seeds)
-
-    def act(self, observations: Observations) -> dict[str, Float32Array]:
-        """Actions (..., m) in [-1, 1] by agent."""
-        require_reset(self, "_policy")
-        return self._policy.act(observations)
-
-    def about_for(self, scenario: str) -> Mapping[str, Any]:
-        """Settings and versions of the training run of the policy for a scenario.
-
-        Raises:
-            PolicyFileError: if none is shipped for the scenario, or several are and no environment was named.
-        """
-        ending = pretrained_name(self.environment or "", scenario)
-        found = sorted(path for path in PRETRAINED.glob("*.npz") if path.stem.endswith(ending))
-        if not found:
-            wanted = f"{self.environment} on {scenario}" if self.environment else scenario
-            raise PolicyFileError(f"no pretrained policy for {wanted}; available: {_shipped()}")
-        if len(found) > 1:
-            names = " or ".join(f"ppo:pretrained/{path.stem.removesuffix(ending)}" for path in found)
-            raise PolicyFileError(f"there are {len(found)} pretrained policies for {scenario}: choose {names}")
-        return LearnedPolicy.load(found[0]).about
-
-
-def pretrained_name(environment: str, scenario: str) -> str:
-    """File name, without suffix, of the shipped policy for an environment and a scenario, both by name."""
-    return f"{environment}@{scenario.replace(':', '-').replace(',', '-').replace('=', '')}"
-
-
-def _shipped() -> str:
-    return ", ".join(sorted(path.stem.replace("@", " on ") for path in PRETRAINED.glob("*.npz"))) or "none"
 
 
 def _filled(memory: Float32Array, batch: int, env_ids: IntArray, value: float) -> Float32Array:

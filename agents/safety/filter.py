@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.learning.learned import LearnedPolicy, PretrainedPolicy
+from agents.learning.learned import LearnedPolicy
+from agents.learning.pretrained import PretrainedPolicy
 from agents.others import Others, side_by_side
 from agents.policy import EnvDescription, Observations, Policy, require_description, require_policy, require_reset
 from agents.safety.checks import checked, is_number, require_state
@@ -309,8 +310,7 @@ class SafetyFilter:
         if getattr(policy, "needs_bounds", False):
             return True
         if isinstance(policy, PretrainedPolicy):
-            policy.environment = policy.environment or env.environment
-            return bool(policy.about_for(env.scenario).get("bounds"))
+            policy = policy.chosen(env)
         return isinstance(policy, LearnedPolicy) and bool(policy.about.get("bounds"))
 
 
