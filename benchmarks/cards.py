@@ -13,6 +13,7 @@ from agents.learning.learned import LearnedPolicy
 from agents.learning.pretrained import Shipped, digest, shipped
 from agents.outcomes import interval95
 from benchmarks.publish import commit
+from khop_env.network import RandomLinks
 from khop_env.registry import scenario
 from khop_env.simulation import Observe
 from khop_env.terminal import Progress
@@ -20,6 +21,7 @@ from khop_env.terminal import Progress
 SCRIPTS = ("tanh", "linear", "formation", "leader_following")
 IN_NAVIGATION = ("keep_right", "go_to_goal", "orca")
 FIRST_SEED = 0
+UP = 0.8  # part of the time in which a link is up, where links come and go
 NETWORKS = ("ideal", "wifi", "lossy:loss=0.3,burst=5")
 """Over which policies that were trained over a network are played."""
 
@@ -32,12 +34,14 @@ class Condition(NamedTuple):
         observe: what is known of agents that aren't neighbours.
         arguments: of the environment.
         inside: the safety filter in which policies act, "filter:OPTIONS:"; "" for none.
+        up: whether links come and go at random, `UP`.
     """
 
     label: str
     observe: Observe = "estimate"
     arguments: Mapping[str, Any] = {}
     inside: str = ""
+    up: bool = False
 
 
 def conditions(policy: Shipped) -> Iterator[Condition]:
@@ -60,9 +64,8 @@ def conditions(policy: Shipped) -> Iterator[Condition]:
         for name in names:
             yield Condition(f"over `{name}`", arguments={**own, "network": name}, inside=inside)
     yield Condition("on neighbours only", "local", own, inside)
-    if shield is None:
-        lag = {**own, "actuator": "lag"}
-        yield Condition("inputs that lag", arguments=lag)
+    if network is None:
+        yield Condition(f"each link up {100.0 * UP:g} % of the time", up=True)
 
 
 def cards(episodes: int, workers: int) -> str:
@@ -81,8 +84,8 @@ def cards(episodes: int, workers: int) -> str:
         f"Each policy was measured on {episodes} episodes, seeds {FIRST_SEED} to {FIRST_SEED + episodes - 1}, on which "
         "none was trained or selected, beside the script that is best of all under the first condition (with the "
         "parameters that `khop tune` found). Returns are means over agents of an episode's sum, larger is better; ± is "
-        "the 95 % interval over episodes. The difference is learned minus script, paired by episode; it is in bold where its "
-        "interval excludes 0.",
+        "the 95 % interval over episodes. The difference is learned minus script, paired by episode; it is in bold "
+        "where its interval excludes 0.",
         "",
         "| name | environment | scenario | network | beside the best script |",
         "|---|---|---|---|---|",
@@ -141,11 +144,12 @@ For `{policy.environment}` on `{policy.scenario}`, network: {_code(network)}. Fi
 
 
 def _compared(policy: Shipped, condition: Condition, scripts: Sequence[str], episodes: int, workers: int) -> Comparison:
+    where = scenario(policy.scenario)
     return compare(
         policy.environment,
         [f"{condition.inside}{name}" for name in (f"ppo:pretrained/{policy.name}", *scripts)],
         [condition.observe],
-        scenario=policy.scenario,
+        scenario=where.replace(schedule=RandomLinks(UP)) if condition.up else where,
         seeds=range(FIRST_SEED, FIRST_SEED + episodes),
         arguments=condition.arguments,
         workers=workers,

@@ -124,21 +124,26 @@ def slots(env: KHopEnv, agent: str) -> str:
 
 def policies(name: str, module: Any) -> str:
     """Which policies there are for an environment."""
-    from agents.learning import PRETRAINED, LearnedPolicy
+    from agents.learning import shipped
 
     task = module.parallel_env().batched.task
     default = task.default_policy or scenario(task.default_scenario).law.name
-    shipped = [LearnedPolicy.load(path).about["scenario"] for path in sorted(PRETRAINED.glob(f"{name}@*.npz"))]
-    where = "" if shipped[0] == task.default_scenario else f" --scenario {shipped[0]}"
+    trained = [each for each in shipped().values() if each.environment == name]
+    listed = "\n".join(
+        f"- `ppo:pretrained/{each.name}` for `{each.scenario}`" + (f" over `{each.network}`" if each.network else "")
+        for each in trained
+    )
     measured = "[](../benchmarks/learning.md)" + ", [](../benchmarks/safety.md)" * (task.default_policy is not None)
     return f"""
 ## Policies
 
-`khop run {name}` plays `{default}`, and another policy with `--controller`. Trained policies are shipped for
-{" and ".join(f"`{each}`" for each in shipped)}:
+`khop run {name}` plays `{default}`, and another policy with `--controller`. [Trained policies](../pretrained.md) are
+shipped; `ppo:pretrained` is the one that fits:
+
+{listed}
 
 ```
-khop run {name}{where} --controller ppo:pretrained
+khop run {name} --controller ppo:pretrained
 ```
 
 What policies reach: {measured}.

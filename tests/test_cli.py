@@ -56,11 +56,25 @@ class TestList:
         found = khop("list").stdout
         for name in ("paper", "mixed_fleet", "random_geometric", "agents=100", "leader_following_v0"):
             assert name in found
+        assert re.search(r"leader_following_convoy_lossy +leader_following_v0 +convoy +lossy:loss=0.3,burst=5", found)
 
     def test_json(self):
         found = only_json(khop("list", "--json"))
         assert [each["name"] for each in found["scenarios"]] == list(SCENARIOS)
         assert found["environments"] == list(ENVIRONMENTS)
+        assert {
+            "name": "consensus_paper",
+            "environment": "consensus_v0",
+            "scenario": "paper",
+            "network": None,
+        } in found["policies"]
+
+    def test_card(self):
+        found = khop("list", "--card", "leader_following_convoy").stdout
+        assert found.startswith("## `leader_following_convoy`\n")
+        assert "**Fails.**" in found
+        assert found.count("\n## ") == 0
+        assert "no pretrained policy 'convoy'; there are consensus_paper, " in refused("list", "--card", "convoy")
 
 
 LONG = "linear:gain=2,cancel_drift=true"

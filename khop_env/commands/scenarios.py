@@ -1,9 +1,10 @@
-"""`khop list`, `check` and `export`: the scenarios and environments, and the conditions of a scenario's observers."""
+"""`khop list`, `check` and `export`: scenarios, environments, policies, and the conditions of a scenario's observers."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -19,14 +20,30 @@ from khop_env.commands.common import (
     networked,
     print_json,
 )
+from khop_env.own_agents import FOLDER
 from khop_env.terminal import print_table, print_text, waiting
 
 
-def list_scenarios(as_json: JsonOption = False) -> None:
-    """List the scenarios, a line each, and the environments, which run on all of them."""
-    found = describe()
+def list_scenarios(
+    card: Annotated[
+        str | None,
+        typer.Option(
+            metavar="POLICY",
+            help="Print the card of a pretrained policy, in Markdown: how it was trained, what it reaches, where it "
+            "fails.",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the scenarios, a line each, the environments, which run on all of them, and the pretrained policies."""
+    if card is not None:
+        with mistakes():
+            text = _card(card)
+        typer.echo(text, nl=False)
+        return
+    found, policies = describe(), _policies()
     if as_json:
-        print_json({"scenarios": found, "environments": list(ENVIRONMENTS)})
+        print_json({"scenarios": found, "environments": list(ENVIRONMENTS), "policies": policies})
         return
     print_table(
         ("scenario", "parameters", "description"),
@@ -40,6 +57,33 @@ def list_scenarios(as_json: JsonOption = False) -> None:
         ],
     )
     print_text(f"environments: {', '.join(ENVIRONMENTS)}")
+    print_table(
+        ("ppo:pretrained/", "environment", "scenario", "network"),
+        [(each["name"], each["environment"], each["scenario"], each["network"] or "") for each in policies],
+    )
+
+
+_PRETRAINED = FOLDER / "learning" / "pretrained"  # read without importing agents
+
+
+def _policies() -> list[dict[str, str | None]]:
+    """Name, environment, scenario and network of each pretrained policy; None for the scenario's own network."""
+    found = tomllib.loads((_PRETRAINED / "index.toml").read_text(encoding="utf-8"))
+    keys = ("environment", "scenario", "network")
+    return [{"name": name, **{key: found[name].get(key) for key in keys}} for name in sorted(found)]
+
+
+def _card(name: str) -> str:
+    """The card of a pretrained policy.
+
+    Raises:
+        ValueError: if there is no such policy.
+    """
+    cards = (_PRETRAINED / "README.md").read_text(encoding="utf-8").split("\n## ")[1:]
+    for card in cards:
+        if card.startswith(f"`{name}`\n"):
+            return f"## {card.rstrip()}\n"
+    raise ValueError(f"no pretrained policy {name!r}; there are {', '.join(str(each['name']) for each in _policies())}")
 
 
 def check(

@@ -14,7 +14,7 @@ from agents.learning import (
     LearnedPolicy,
     ObservationScaler,
     PolicyFileError,
-    pretrained_name,
+    shipped,
 )
 from agents.learning.environment import training_environment
 from agents.learning.networks import make_model
@@ -87,7 +87,8 @@ def test_agents_with_a_heading_see_others_in_their_own_frame():
 def test_scales_are_found_by_name(path):
     """Features equal those of the shipped policies bit for bit, and don't depend on the order of columns."""
     policy = LearnedPolicy.load(path)
-    env = batched(policy.environment, policy.about["scenario"], num_envs=2)
+    over = {name: policy.about.get("arguments", {}).get(name) for name in ("network", "estimator")}
+    env = batched(policy.environment, policy.about["scenario"], num_envs=2, **over)
     description = describe(env)
     chosen = {"rates": policy.about["rates"], "nearest": policy.about.get("nearest", False)}
     scaler = ObservationScaler.of(description, **chosen)
@@ -274,23 +275,6 @@ def test_a_learned_policy_is_run_filmed_and_compared(trained, tmp_path):
     assert "trained on mixed_fleet with 3 entries per action; this environment has [2]" in refused.stderr
 
 
-SHIPPED = sorted(PRETRAINED.glob("*.npz"))
-
-
-def test_policies_are_shipped():
-    assert len(SHIPPED) >= 4
-    with pytest.raises(PolicyFileError, match=r"no pretrained policy for .* on convoy; available: .*To train"):
-        make_policy("ppo:pretrained").reset(describe(batched("consensus_v0", "convoy", num_envs=1)), [0])
-
-
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_shipped_policies_are_small_and_named_after_what_they_are_for(path):
-    assert path.stat().st_size < 1_000_000
-    about = LearnedPolicy.load(path).about
-    assert path.stem == pretrained_name(about["environment"], about["scenario"])
-    assert about["observe"] == "estimate"
-
-
 def test_the_shipped_policy_for_navigation_arrives_in_the_filter():
     """Without collisions; played outside of it, it collides, and a warning says why."""
     spec = "filter:announce=true:ppo:pretrained"
@@ -304,17 +288,16 @@ def test_the_shipped_policy_for_navigation_arrives_in_the_filter():
     assert found["collision"].mean() > 0.5
 
 
-OTHERS = [path for path in SHIPPED if not path.stem.startswith("navigation_v0")]
+OTHERS = [policy for policy in shipped().values() if policy.environment != "navigation_v0"]
 
 
-@pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.stem)
-def test_shipped_policies_are_good(path):
+@pytest.mark.parametrize("policy", OTHERS, ids=lambda policy: policy.name)
+def test_shipped_policies_are_good(policy):
     """Far better than zero inputs, and much better on estimates than on neighbours only."""
-    about = LearnedPolicy.load(path).about
-    environment, scenario = about["environment"], about["scenario"]
     found = {}
     for mode in ("estimate", "local"):
-        env = batched(environment, scenario, num_envs=20, observe=mode)
+        over = {} if policy.network is None else {"network": policy.network}
+        env = batched(policy.environment, policy.scenario, num_envs=20, observe=mode, **over)
         found[mode] = play(env, make_policy("ppo:pretrained"), range(20))
         zero = play(env, make_policy("zero"), range(20)).returns.mean()
     assert found["estimate"].returns.mean() > 0.2 * zero  # returns are negative

@@ -74,7 +74,7 @@ def test_without_any_message_nobody_moves():
 
 def test_a_learned_policy_of_other_columns_is_refused():
     """Trained without a network, and used under one; and the other way round."""
-    policy = LearnedPolicy.load(PRETRAINED / "consensus_v0@paper.npz")
+    policy = LearnedPolicy.load(PRETRAINED / "consensus_paper.npz")
     ideal, networked = (describe(batched("consensus_v0", network=network)) for network in (None, "wifi"))
     policy.reset(ideal, [0])
     with pytest.raises(PolicyFileError, match=r"'slot0.task_edge' there and 'slot0.age' here; .* without a network"):

@@ -7,13 +7,12 @@ import zipfile
 import numpy as np
 import pytest
 
-from agents import describe, make_policy, play
+from agents import describe, make_policy
 from agents.learning import PRETRAINED, LearnedPolicy, PolicyFileError
 from agents.learning.archive import ArchiveError, read_arrays, write_arrays
-from khop_env.registry import make_batched
 from tests.env.playing import batched
 
-GOOD = PRETRAINED / "leader_following_v0@mixed_fleet.npz"  # with headings, so that every index array is used
+GOOD = PRETRAINED / "leader_following_mixed_fleet.npz"  # with headings, so that every index array is used
 MUTATIONS = 300
 
 
@@ -198,46 +197,3 @@ def test_archives_come_back_as_they_were(tmp_path):
         assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.npz"]
     with pytest.raises(ArchiveError, match="isn't a regular file"):
         read_arrays(tmp_path, 10_000)
-
-
-def test_the_choice_between_several_shipped_policies_is_named(tmp_path, monkeypatch):
-    """A single policy for the scenario is used; among several a name is required; file order is irrelevant."""
-    from agents.running import policy_run
-    from khop_env.registry import scenario
-
-    policy = make_policy("ppo:pretrained")
-    assert policy.about_for("convoy")["environment"] == "leader_following_v0"
-    for name in ("leader_following_v0@convoy", "consensus_v0@convoy"):
-        (tmp_path / f"{name}.npz").write_bytes((PRETRAINED / "leader_following_v0@convoy.npz").read_bytes())
-    monkeypatch.setattr("agents.learning.learned.PRETRAINED", tmp_path)
-    both = "2 pretrained policies for convoy: choose ppo:pretrained/consensus_v0 or ppo:pretrained/leader_following_v0"
-    with pytest.raises(PolicyFileError, match=both):
-        policy_run("ppo:pretrained", scenario("convoy"), "estimate", 1.0, 0)
-    run = policy_run("ppo:pretrained/leader_following_v0", scenario("convoy"), "estimate", 1.0, 0)
-    assert run.env.batched.task.name == "leader_following"
-    with pytest.raises(
-        PolicyFileError, match="no pretrained policy for formation_v0 on convoy; available: consensus_v0 "
-    ):
-        make_policy("ppo:pretrained/formation_v0").about_for("convoy")
-    with pytest.raises(ValueError, match="no environment 'consensus'; did you mean 'consensus_v0'"):
-        make_policy("ppo:pretrained/consensus")
-    env = make_batched("consensus_v0", "convoy")
-    with pytest.raises(ValueError, match="the policy for leader_following_v0 doesn't fit consensus_v0"):
-        play(env, make_policy("ppo:pretrained/leader_following_v0"), [0])
-
-
-def test_files_of_earlier_versions_have_one_kind_of_network(tmp_path):
-    """Their meta doesn't name it; a name that there isn't is refused."""
-    arrays = contents()
-    meta = json.loads(str(arrays["meta"]))
-    assert "network" not in meta
-    policy = LearnedPolicy.load(GOOD)
-    policy.save(tmp_path / "again.npz")
-    again = read_arrays(tmp_path / "again.npz", 2**24)
-    assert json.loads(str(again.pop("meta"))) == {**meta, "network": "mlp"}
-    assert all(np.array_equal(array, arrays[name]) for name, array in again.items() if name in arrays)
-    write_arrays(
-        tmp_path / "other.npz", {**arrays, "meta": np.array(json.dumps({**meta, "network": "x"}))}, compress=True
-    )
-    with pytest.raises(PolicyFileError, match=r"other.npz isn't a policy .*its network is 'x'"):
-        LearnedPolicy.load(tmp_path / "other.npz")

@@ -120,13 +120,13 @@ def test_the_film_is_there(page):
 
 
 def test_policies_are_shipped(page):
-    from agents.learning import PRETRAINED, pretrained_name
+    from agents.learning import shipped
 
     name, text = page
-    scenarios = re.findall(r"`([^`]+)`", re.search(r"are shipped for\n(.*):\n", text)[1])
-    assert {pretrained_name(name, each) for each in scenarios} == {path.stem for path in PRETRAINED.glob(f"{name}@*")}
-    command = re.search(r"(?m)^khop run \S+( --scenario (\S+))? --controller ppo:pretrained$", text)
-    assert (command[2] or khop_env.make(name).batched.task.default_scenario) in scenarios
+    listed = re.findall(r"(?m)^- `ppo:pretrained/(\w+)` for `([^`]+)`(?: over `([^`]+)`)?$", text)
+    of_it = [policy for policy in shipped().values() if policy.environment == name]
+    assert listed == [(policy.name, policy.scenario, policy.network or "") for policy in of_it]
+    assert f"\nkhop run {name} --controller ppo:pretrained\n" in text
 
 
 def test_the_comparison_is_true(page):
