@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,9 +23,22 @@ from khop_env.terminal import Progress
 SCRIPTS = ("tanh", "linear", "formation", "leader_following")
 IN_NAVIGATION = ("keep_right", "go_to_goal", "orca")
 FIRST_SEED = 0
-UP = 0.8  # part of the time in which a link is up, where links come and go
+UP = 0.8  # probability that a link is there, where each episode draws its own graph
 NETWORKS = ("ideal", "wifi", "lossy:loss=0.3,burst=5")
 """Over which policies that were trained over a network are played."""
+
+
+HEAD = """# Cards of the pretrained policies
+
+<!-- written by python -m benchmarks.pretrained; the sentences on failures are in index.toml -->
+
+Each policy is measured on episodes on which none was trained or selected, beside the script that is best of all under
+the first condition (with the parameters that `khop tune` found). Returns are means over agents of an episode's sum,
+larger is better; ± is the 95 % interval over episodes. The difference is learned minus script, paired by episode; it is
+in bold where its interval excludes 0.
+
+| name | environment | scenario | network | difference from the best script |
+|---|---|---|---|---|"""
 
 
 class Condition(NamedTuple):
@@ -34,7 +49,7 @@ class Condition(NamedTuple):
         observe: what is known of agents that aren't neighbours.
         arguments: of the environment.
         inside: the safety filter in which policies act, "filter:OPTIONS:"; "" for none.
-        up: whether links come and go at random, `UP`.
+        up: whether each episode has only some of the links, each with probability `UP`.
     """
 
     label: str
@@ -65,82 +80,97 @@ def conditions(policy: Shipped) -> Iterator[Condition]:
             yield Condition(f"over `{name}`", arguments={**own, "network": name}, inside=inside)
     yield Condition("on neighbours only", "local", own, inside)
     if network is None:
-        yield Condition(f"each link up {100.0 * UP:g} % of the time", up=True)
+        yield Condition(f"{100.0 * (1.0 - UP):.0f} % of the links down, drawn anew for each episode", up=True)
 
 
-def cards(episodes: int, workers: int) -> str:
-    """All cards in Markdown, measured.
+def write_cards(path: Path, episodes: int, workers: int, *, again: bool = False) -> None:
+    """Write all cards in Markdown; policies whose file has a card with as many episodes aren't measured again.
+
+    The file is written after each policy, so that an interrupted command can be continued.
 
     Args:
+        path: of the cards; what was measured is taken from there.
         episodes: of each row, from seed 0.
         workers: number of processes.
+        again: whether to measure all.
     """
-    found = list(shipped().values())
-    lines = [
-        "# Cards of the pretrained policies",
-        "",
-        f"<!-- written by python -m benchmarks.pretrained on {date.today().isoformat()}, {commit()} -->",
-        "",
-        f"Each policy was measured on {episodes} episodes, seeds {FIRST_SEED} to {FIRST_SEED + episodes - 1}, on which "
-        "none was trained or selected, beside the script that is best of all under the first condition (with the "
-        "parameters that `khop tune` found). Returns are means over agents of an episode's sum, larger is better; ± is "
-        "the 95 % interval over episodes. The difference is learned minus script, paired by episode; it is in bold "
-        "where its interval excludes 0.",
-        "",
-        "| name | environment | scenario | network | beside the best script |",
-        "|---|---|---|---|---|",
-    ]
-    bodies = []
-    with Progress("measuring the policies") as progress:
-        for number, policy in enumerate(found):
-            summary, body = _card(policy, episodes, workers)
-            lines.append(summary)
-            bodies.append(body)
-            progress((number + 1) / len(found))
-    return "\n".join([*lines, "", *bodies])
+    written = path.read_text(encoding="utf-8") if path.exists() else ""
+    policies = shipped()
+    blocks = {name: _kept(name, written, episodes) for name in policies}
+    with Progress("measuring policies") as progress:
+        for number, policy in enumerate(policies.values()):
+            if again or blocks[policy.name] is None:
+                blocks[policy.name] = _measured(policy, episodes, workers)
+                progress.say(f"{policy.name}: {_verdict(blocks[policy.name] or '')}")
+            path.write_text(_text(policies, blocks), encoding="utf-8")
+            progress((number + 1) / len(policies))
 
 
-def _card(policy: Shipped, episodes: int, workers: int) -> tuple[str, str]:
-    """The line in the list, and the card."""
-    about = LearnedPolicy.load(policy.path).about
-    rows, first, best = [], None, ""
+def _kept(name: str, written: str, episodes: int) -> str | None:
+    """What was measured of the file that is there now; None if nothing was."""
+    card = re.search(rf"(?ms)^## `{name}`\n(.*?)(?=^## |\Z)", written)
+    if card is None or f"`{digest(name)}`" not in card[1]:
+        return None
+    block = re.search(rf"(?ms)^\*\*Reaches\*\* on {episodes} episodes .*?(?=\n\n\*\*Fails)", card[1])
+    return None if block is None else block[0]
+
+
+def _verdict(block: str) -> str:
+    """The difference from the script under the first condition."""
+    found = re.search(r"(?m)^\| as trained \|.*?\|.*?\| (.*?) \|", block)
+    return "" if found is None else found[1]
+
+
+def _measured(policy: Shipped, episodes: int, workers: int) -> str:
+    """The table of a card, and what it was measured with."""
+    navigation = policy.environment == "navigation_v0"
+    rows, best = [], ""
     for condition in conditions(policy):
-        candidates = (IN_NAVIGATION if policy.environment == "navigation_v0" else SCRIPTS) if first is None else (best,)
-        compared = _compared(policy, condition, candidates, episodes, workers)
-        learned, *scripts = compared.rows
+        candidates = (best,) if best else IN_NAVIGATION if navigation else SCRIPTS
+        learned, *scripts = _compared(policy, condition, candidates, episodes, workers).rows
         script = max(scripts, key=lambda row: float(row.episodes.returns.mean()))
         best = script.policy.removeprefix(condition.inside)
-        difference = _difference(learned, script)
-        first = first or difference
-        rows.append(_row(condition, learned, script, difference))
-    navigation = policy.environment == "navigation_v0"
+        rows.append(_row(condition, learned, script))
     header = ["", "learned: return", f"`{best}`: return", "difference", "error at the end, learned / script"]
     header += ["collided, learned / script", "all arrived, learned / script"] * navigation
-    unit = learned.env.error_unit
-    network = policy.network or ("the scenario's own" if policy.over(scenario(policy.scenario))[0] else "none")
-    made = "\n".join(policy.train)
-    text = f"""## `{policy.name}`
+    head = f"**Reaches** on {episodes} episodes (measured on {date.today().isoformat()}, {commit()}; errors in "
+    return "\n".join(
+        [f"{head}{learned.env.error_unit})", "", f"| {' | '.join(header)} |", f"{'|---' * len(header)}|", *rows]
+    )
 
-For `{policy.environment}` on `{policy.scenario}`, network: {_code(network)}. File `{policy.name}.npz`, \
+
+def _text(policies: Mapping[str, Shipped], blocks: Mapping[str, str | None]) -> str:
+    """All cards of the policies that were measured."""
+    lines, cards = [HEAD], []
+    for policy in policies.values():
+        if (block := blocks[policy.name]) is not None:
+            where = f"| `{policy.name}` | `{policy.environment}` | `{policy.scenario}` | {_network(policy)} |"
+            lines.append(f"{where} {_verdict(block)} |")
+            cards.append(_card(policy, block))
+    return "\n".join([*lines, "", *cards])
+
+
+def _card(policy: Shipped, block: str) -> str:
+    about = LearnedPolicy.load(policy.path).about
+    bounds = " with bounds" if about["bounds"] else ""
+    versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
+    return f"""## `{policy.name}`
+
+For `{policy.environment}` on `{policy.scenario}`, network: {_network(policy)}. File `{policy.name}.npz`, \
 {policy.path.stat().st_size / 1000:.0f} kB, SHA-256 `{digest(policy.name)}`.
 
-**Trained** on {policy.trained.isoformat()} with seed {about["seed"]}; it is the best evaluation of \
-{about["timesteps"]:,} agent-steps, after {about["trained"]:,}, on observations of kind `{about["observe"]}`\
-{" with bounds" if about["bounds"] else ""}, with {_versions(about)}:
+**Trained** on {policy.trained.isoformat()} with seed {about["seed"]}, on observations of kind \
+`{about["observe"]}`{bounds}; the best evaluation of {about["timesteps"]:,} agent-steps, after {about["trained"]:,}. \
+{versions}:
 
 ```
-{made}
+{chr(10).join(policy.train)}
 ```
 
-**Reaches** (errors in {unit})
-
-| {" | ".join(header)} |
-{"|---" * len(header)}|
-{chr(10).join(rows)}
+{block}
 
 **Fails.** {policy.fails.strip()}
 """
-    return f"| `{policy.name}` | `{policy.environment}` | `{policy.scenario}` | {_code(network)} | {first} |", text
 
 
 def _compared(policy: Shipped, condition: Condition, scripts: Sequence[str], episodes: int, workers: int) -> Comparison:
@@ -156,10 +186,10 @@ def _compared(policy: Shipped, condition: Condition, scripts: Sequence[str], epi
     )
 
 
-def _row(condition: Condition, learned: Row, script: Row, difference: str) -> str:
+def _row(condition: Condition, learned: Row, script: Row) -> str:
     pair = [row.summary() for row in (learned, script)]
     returns = [f"{each['mean_return']:.3g} ± {each['ci95'] or 0.0:.2g}" for each in pair]
-    cells = [condition.label, *returns, difference]
+    cells = [condition.label, *returns, _difference(learned, script)]
     cells.append(" / ".join(f"{each['final_task_error']:.2g}" for each in pair))
     for rate in ("collision_rate", "success_rate"):
         if rate in pair[0]:
@@ -176,9 +206,9 @@ def _difference(learned: Row, script: Row) -> str:
     return f"**{text}**" if abs(mean) > half else text
 
 
-def _versions(about: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {version}" for name, version in about["versions"].items())
-
-
-def _code(network: str) -> str:
-    return f"`{network}`" if ":" in network or network in NETWORKS else network
+def _network(policy: Shipped) -> str:
+    """The network of the training, for a table."""
+    if policy.network is not None:
+        return f"`{policy.network}`"
+    network, _ = policy.over(scenario(policy.scenario))
+    return "none" if network is None else "the scenario's own"

@@ -1,11 +1,12 @@
 """The policies that come with the library: train them again, exchange them, and write their cards.
 
-    python -m benchmarks.pretrained                            # measures all and writes their cards: 3 minutes
+    python -m benchmarks.pretrained                            # measures those without a card, and writes the cards
     python -m benchmarks.pretrained --train NAME ...           # runs their `khop train` commands, and takes the results
     python -m benchmarks.pretrained --take NAME=FOLDER ...     # takes the best policy of a run; NAME may be new
 
 Cards (agents/learning/pretrained/README.md, docs/pretrained.md) belong to the files that they were measured with, by
-their hashes: after a file was exchanged, cards have to be written again, and so do the films of `docs/gallery.md`.
+their hashes: after a file was exchanged its card has to be written again (half a minute each), and so do the films of
+`docs/gallery.md`. What index.toml says is written into the cards without measuring again.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import tomlkit
 from agents.learning.config import TrainingConfig
 from agents.learning.learned import LearnedPolicy
 from agents.learning.pretrained import PRETRAINED, shipped
-from benchmarks.cards import cards
+from benchmarks.cards import write_cards
 from khop_env.registry import find_task
 from khop_env.terminal import say
 
@@ -156,7 +157,8 @@ def main() -> None:
     parser.add_argument("--train", nargs="*", metavar="NAME", help="train these again, or all")
     parser.add_argument("--take", nargs="+", metavar="NAME=RUN", help="exchange them for the best policies of runs")
     parser.add_argument("--episodes", type=int, default=100, help="of each row of a card; 100 by default")
-    parser.add_argument("--workers", type=int, default=2, help="processes; 2 by default")
+    parser.add_argument("--again", action="store_true", help="measure those that have a card, too")
+    parser.add_argument("--workers", type=int, default=1, help="processes; 1 by default, which is faster for 100 episodes")
     chosen = parser.parse_args()
     try:
         for pair in chosen.take or ():
@@ -166,8 +168,7 @@ def main() -> None:
             for name in list(_names(chosen.train or list(shipped()))):
                 train(name)
         if chosen.take is None and chosen.train is None:
-            text = cards(chosen.episodes, chosen.workers)
-            (PRETRAINED / "README.md").write_text(text, encoding="utf-8")
+            write_cards(PRETRAINED / "README.md", chosen.episodes, chosen.workers, again=chosen.again)
     except (ValueError, subprocess.CalledProcessError) as error:
         parser.error(str(error))
 

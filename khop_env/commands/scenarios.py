@@ -1,4 +1,4 @@
-"""`khop list`, `check` and `export`: scenarios, environments, policies, and the conditions of a scenario's observers."""
+"""`khop list`, `check` and `export`: scenarios, environments, policies, and the conditions of observers."""
 
 from __future__ import annotations
 
