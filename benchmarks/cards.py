@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.comparison import Comparison, Row, compare
+from agents.learning.config import TrainingConfig
 from agents.learning.learned import LearnedPolicy
 from agents.learning.pretrained import Shipped, digest, shipped
 from agents.outcomes import interval95
@@ -154,6 +156,14 @@ def _card(policy: Shipped, block: str) -> str:
     about = LearnedPolicy.load(policy.path).about
     bounds = " with bounds" if about["bounds"] else ""
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
+    since = [f"`{each.name}`" for each in fields(TrainingConfig) if each.name not in about]
+    made = "\n".join(policy.train)
+    if since:
+        made += (
+            f"\n```\n\nThese settings are newer than it, and the commands train differently now: {', '.join(since)}."
+        )
+    else:
+        made += "\n```"
     return f"""## `{policy.name}`
 
 For `{policy.environment}` on `{policy.scenario}`, network: {_network(policy)}. File `{policy.name}.npz`, \
@@ -164,8 +174,7 @@ For `{policy.environment}` on `{policy.scenario}`, network: {_network(policy)}. 
 {versions}:
 
 ```
-{chr(10).join(policy.train)}
-```
+{made}
 
 {block}
 

@@ -158,7 +158,9 @@ def main() -> None:
     parser.add_argument("--take", nargs="+", metavar="NAME=RUN", help="exchange them for the best policies of runs")
     parser.add_argument("--episodes", type=int, default=100, help="of each row of a card; 100 by default")
     parser.add_argument("--again", action="store_true", help="measure those that have a card, too")
-    parser.add_argument("--workers", type=int, default=1, help="processes; 1 by default, which is faster for 100 episodes")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="processes; 1 by default, which is faster for 100 episodes"
+    )
     chosen = parser.parse_args()
     try:
         for pair in chosen.take or ():

@@ -58,7 +58,8 @@ def stamp(command: str) -> str:
 
 def commit() -> str:
     """The repository's commit, and whether code differs from it."""
-    changed = _git("status", "--porcelain", "--", "khop_env", "agents", "benchmarks")
+    code = ("khop_env", "agents", "benchmarks", ":(exclude)agents/learning/pretrained")  # cards name policies by hash
+    changed = _git("status", "--porcelain", "--", *code)
     return f"commit {_git('rev-parse', '--short=10', 'HEAD') or 'unknown'}{', with changes' if changed else ''}"
 
 
