@@ -197,7 +197,7 @@ def _compared(policy: Shipped, condition: Condition, scripts: Sequence[str], epi
 
 def _row(condition: Condition, learned: Row, script: Row) -> str:
     pair = [row.summary() for row in (learned, script)]
-    returns = [f"{each['mean_return']:.3g} ± {each['ci95'] or 0.0:.2g}" for each in pair]
+    returns = [f"{each['mean_return']:.3g} ± {_short(each['ci95'] or 0.0)}" for each in pair]
     cells = [condition.label, *returns, _difference(learned, script)]
     cells.append(" / ".join(f"{each['final_task_error']:.2g}" for each in pair))
     for rate in ("collision_rate", "success_rate"):
@@ -211,8 +211,13 @@ def _difference(learned: Row, script: Row) -> str:
     more = learned.episodes.returns - script.episodes.returns
     mean, half = float(more.mean()), interval95(more) or 0.0
     percent = 100.0 * mean / abs(float(np.mean(script.episodes.returns)))
-    text = f"{mean:+.2g} ± {half:.2g} ({percent:+.2g} %)"
+    text = f"{_short(mean, '+')} ± {_short(half)} ({_short(percent, '+')} %)"
     return f"**{text}**" if abs(mean) > half else text
+
+
+def _short(value: float, sign: str = "") -> str:
+    """Two digits, or all before the point."""
+    return f"{value:{sign}.0f}" if abs(value) >= 10.0 else f"{value:{sign}.2g}"
 
 
 def _network(policy: Shipped) -> str:
