@@ -68,7 +68,9 @@ class Side:
         )
 
     def in_view(self, scene: Scene) -> FloatArray:
-        """(K, 2) points in m that the view has to hold: agents, estimates, and what a view follows of their boxes."""
+        """(K, 2) points in m that the view has to hold: agents, estimates, what a view follows of their boxes, and what
+        the task draws.
+        """
         positions = self._batched.world.positions()[..., 0]
         middles, extent = self._estimates.positions(scene.estimates), Extent()
         half = self._estimates.half_widths_in_view(scene.bounds)
@@ -77,7 +79,7 @@ class Side:
         if extent.points:  # as in `Renderer`
             half = np.zeros_like(half)
         points = np.concatenate([positions, middles - half, middles + half])[:, :2]
-        points = np.pad(points, ((0, 0), (0, 2 - points.shape[1])))
+        points = np.concatenate([np.pad(points, ((0, 0), (0, 2 - points.shape[1]))), *extent.points])
         found: FloatArray = points[np.isfinite(points).all(axis=1)]
         return found
 
