@@ -66,7 +66,7 @@ def list_scenarios(
 _PRETRAINED = FOLDER / "learning" / "pretrained"  # read without importing agents
 
 
-def _policies() -> list[dict[str, str | None]]:
+def _policies() -> list[dict[str, Any]]:
     """Name, environment, scenario and network of each pretrained policy; None for the scenario's own network."""
     found = tomllib.loads((_PRETRAINED / "index.toml").read_text(encoding="utf-8"))
     keys = ("environment", "scenario", "network")
@@ -83,7 +83,7 @@ def _card(name: str) -> str:
     for card in cards:
         if card.startswith(f"`{name}`\n"):
             return f"## {card.rstrip()}\n"
-    raise ValueError(f"no pretrained policy {name!r}; there are {', '.join(str(each['name']) for each in _policies())}")
+    raise ValueError(f"no pretrained policy {name!r}; there are {', '.join(each['name'] for each in _policies())}")
 
 
 def check(
