@@ -80,7 +80,8 @@ def conditions(policy: Shipped) -> Iterator[Condition]:
         names = [name for name in NETWORKS if name != policy.network]
         for name in names:
             yield Condition(f"over `{name}`", arguments={**own, "network": name}, inside=inside)
-    yield Condition("on neighbours only", "local", own, inside)
+    if shield is None or not shield.startswith("certified"):  # which needs to know where others may be
+        yield Condition("on neighbours only", "local", own, inside)
     if network is None:
         yield Condition(f"{100.0 * (1.0 - UP):.0f} % of the links down, drawn anew for each episode", up=True)
 
