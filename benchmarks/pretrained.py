@@ -107,7 +107,6 @@ def take(name: str, source: Path, *, keep_commands: bool = False) -> None:
             entry[key] = _network(value)
         elif key in entry:
             del entry[key]
-    entry["trained"] = datetime.date.fromtimestamp(file.stat().st_mtime)
     if not keep_commands:
         commands = [command_of(about, RUNS / name)]
         while about.get("initial"):
@@ -123,6 +122,7 @@ def take(name: str, source: Path, *, keep_commands: bool = False) -> None:
     target = PRETRAINED / f"{name}.npz"
     if not target.exists() or target.read_bytes() != file.read_bytes():
         shutil.copyfile(file, target)
+        entry["trained"] = datetime.date.fromtimestamp(file.stat().st_mtime)
         entry["fails"] = ""  # was said of another file
         say(f"{name}: another file than before; measure it, and say in {INDEX.name} where it fails")
     INDEX.write_text(tomlkit.dumps(document), encoding="utf-8")
