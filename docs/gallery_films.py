@@ -18,7 +18,7 @@ HEAD = """# Gallery
 <!-- written by python docs/films.py --gallery; the sentences are in docs/gallery_films.py -->
 
 Each film is one episode twice: the same starts, disturbances and lost messages, on the left under a
-[tuned script](guides/policy.md), on the right under the learned policy that ships for it
+[script](guides/policy.md), on the right under the learned policy that ships for it
 ([how each was trained, what it reaches, where it fails](pretrained.md)). Both know agents that aren't their neighbours
 by estimates only. Both maps show the same part of the plane. The episodes weren't chosen: all have seed 0. Films show
 their beginning, the tables below them have the whole episode. What policies reach on average is in their cards, and in
