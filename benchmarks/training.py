@@ -26,10 +26,13 @@ def training_rate(timesteps: int, backend: str = "torch") -> tuple[float, float]
         Agent-steps per second inside `learn`, and the environment's share of the wall time: stepping, resetting and
         observing, without the learner's processing of rewards and features.
     """
+    import torch
+
     from agents.learning import TrainingConfig
     from agents.learning.environment import training_environment
     from agents.learning.networks import make_model
 
+    torch.set_num_threads(1)  # as `khop train` and the peer's script
     config = TrainingConfig("consensus_v0", timesteps=timesteps, backend=backend)  # type: ignore[arg-type]
     env: Any = training_environment(config)
     model = make_model(config, env, [], None)
