@@ -5,7 +5,7 @@ import shlex
 import warnings
 
 import pytest
-import typer
+from typer.testing import CliRunner
 
 from agents import compare, describe, make_policy, play
 from agents.learning import PRETRAINED, LearnedPolicy, PolicyFileError, PretrainedPolicy, load_pretrained, shipped
@@ -44,18 +44,17 @@ class TestIndex:
         assert policy.fails.strip().endswith(".")
 
     @pytest.mark.parametrize("policy", SHIPPED.values(), ids=lambda policy: policy.name)
-    def test_its_last_command_has_the_settings_of_the_file(self, policy, tmp_path):
+    def test_its_last_command_has_the_settings_of_the_file(self, policy, monkeypatch):
         """If defaults have changed since: python -m benchmarks.pretrained --take NAME=agents/.../NAME.npz."""
-        from khop_env.commands.train import _chosen
+        started = []
 
-        about, arguments = load_pretrained(policy.name).about, shlex.split(policy.train[-1])[2:]
-        given = typer.main.get_command(app).commands["train"].make_context("train", arguments).params
-        options = {"algorithm": given["algo"] and given["algo"].value, "observe": given["observe"]}
-        names = ("environment", "scenario", "bounds", "shield", "residual", "initial", "per_type", "timesteps", "seed")
-        options |= {name: given[name] for name in (*names, "num_envs")}
-        options = {name: value for name, value in options.items() if value is not None}
-        over = given["network"], given["estimator"]
-        settings = _chosen(None, given["settings"] or [], options, given["env"] or [], over).as_dict()
+        def train(config, *_, **__):
+            started.append(config)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("agents.learning.training.train", train)
+        CliRunner().invoke(app, shlex.split(policy.train[-1])[1:])
+        about, settings = load_pretrained(policy.name).about, started[0].as_dict()
         settings["scenario"] = settings["scenario"] or find_task(policy.environment).default_scenario
         assert {name: value for name, value in about.items() if name in settings} == {
             name: value for name, value in settings.items() if name in about
