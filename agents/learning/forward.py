@@ -168,10 +168,11 @@ class Recurrent:
         inputs = features
         for weight, bias in self.layers[:-1]:
             inputs = np.maximum(inputs @ weight.T + bias, 0.0)
-        from_inputs, from_before, bias = self.lstm
-        nothing = np.zeros((*features.shape[:-1], len(bias) // 4), np.float32)
+        nothing = np.zeros((*features.shape[:-1], len(self.lstm[2]) // 4), np.float32)
         before, cell = memory or (nothing, nothing)
-        gates = np.split(inputs @ from_inputs.T + before @ from_before.T + bias, 4, axis=-1)
+        # gate by gate: BLAS shares larger products between threads, which wait for each other on a busy machine
+        parts = zip(*(np.split(each, 4) for each in self.lstm), strict=True)
+        gates = [inputs @ weight.T + before @ own.T + bias for weight, own, bias in parts]
         cell = _sigmoid(gates[1]) * cell + _sigmoid(gates[0]) * np.tanh(gates[2])
         output = _sigmoid(gates[3]) * np.tanh(cell)
         return applied(self.layers[-1:], output), (output, cell)
