@@ -123,7 +123,7 @@ class StudyTask:
 
 
 TASKS = (
-    StudyTask("consensus_v0", "paper", 1_000_000),
+    StudyTask("consensus_v0", "paper", 2_000_000),
     StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000),
     StudyTask("leader_following_v0", "convoy", 1_500_000),
     StudyTask("leader_following_v0", "mixed_fleet", 1_500_000),
