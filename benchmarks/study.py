@@ -126,7 +126,7 @@ TASKS = (
     StudyTask("consensus_v0", "paper", 2_000_000),
     StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000),
     StudyTask("leader_following_v0", "convoy", 1_500_000),
-    StudyTask("leader_following_v0", "mixed_fleet", 1_500_000),
+    StudyTask("leader_following_v0", "mixed_fleet", 2_000_000),
     StudyTask("navigation_v0", "crossing", 2_000_000, tuple(NAVIGATION)),
 )
 

@@ -28,7 +28,7 @@ SUITED: Mapping[str, Mapping[str, Any]] = {
     "sac": {"learning_rate": 1e-3, "batch_size": 512},
     "recurrent": {"n_steps": 16},  # errors go back through memory as far as that
     "consensus_v0": {"gamma": 0.8, "learning_rate": 1e-3, "n_steps": 32, "batch_size": 4096},
-    "leader_following_v0": {"huber": 0.2, "log_std_end": 1.0, "reward_memory": 0},  # no limit
+    "leader_following_v0": {"log_std_end": 1.0, "reward_memory": 0},  # no limit
     "attention": {"nearest": False},
     "navigation_v0": {
         "nearest": True,
