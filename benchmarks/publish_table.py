@@ -57,14 +57,14 @@ AIMED = (
     "`keep_right` and `go_to_goal` in the same filter.\n"
 )
 EXPLORING_FIGURE = [*FIGURES][-1]
-EXPLORING = """## Exploration that ends
+EXPLORING = """## Exploration and the unit of rewards
 
-PPO adds noise to its actions, and an entropy bonus keeps it from becoming small. Left alone (`free exploration`), the
-noise may grow for as long as the training goes on. `exploration ends` limits the logarithm of its standard deviation
-to a value that falls from `log_std` to -3, and the bonus to 0. `estimate` is what `khop train` does by itself: it also
-divides rewards by the deviation of the latest returns only (`reward_memory`), since those of the first policies are
-hundreds of times larger, and the settings are those of each environment. Returns on the 32 episodes that select
-policies, without noise: mean over training seeds, and the extremes.
+PPO adds noise to its actions, and an entropy bonus keeps it from becoming small. With `free exploration` the noise is
+the learner's. `exploration ends` limits the logarithm of its standard deviation to a value that falls from `log_std` to
+-3, and the bonus to 0. `and recent rewards` also divides rewards by the deviation of the latest returns only
+(`reward_memory`): those of the first policies are hundreds of times larger. `estimate` is what `khop train` does by
+itself: exploration that ends and recent rewards in consensus and formation, free exploration and all rewards in leader
+following. Returns on the 32 episodes that select policies, without noise: mean over training seeds, and the extremes.
 """
 
 BY_HAND = "<!-- what follows is written by hand -->"

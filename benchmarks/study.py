@@ -86,9 +86,10 @@ NAVIGATION: Mapping[str, Recipe] = {
     "not shielded": Recipe((Play(), Play(inside=FILTER))),
 }
 FREE: Mapping[str, Any] = {"log_std_end": 100.0, "explore": 0.0, "reward_memory": 0}
-EXPLORATION: Mapping[str, Recipe] = {  # beside "estimate"; their learning curves are what is of interest
+EXPLORATION: Mapping[str, Recipe] = {  # their learning curves are what is of interest; one of the three is "estimate"
     "free exploration": Recipe((), FREE, seeds=SEEDS[:3]),
     "exploration ends": Recipe((), {**FREE, "log_std_end": -3.0}, seeds=SEEDS[:3]),
+    "and recent rewards": Recipe((), {**FREE, "log_std_end": -3.0, "reward_memory": 20_000}, seeds=SEEDS[:3]),
 }
 RECIPES: Mapping[str, Recipe] = {**CONTINUOUS, **NETWORKED, **NAVIGATION, **EXPLORATION}
 """All kinds of trainings by name."""
@@ -108,7 +109,7 @@ class StudyTask:
     environment: str
     scenario: str
     timesteps: int
-    recipes: Sequence[str] = (*CONTINUOUS, *NETWORKED, *EXPLORATION)
+    recipes: Sequence[str] = (*CONTINUOUS, *NETWORKED)
 
     @property
     def label(self) -> str:
@@ -122,11 +123,12 @@ class StudyTask:
         return self.scenario.partition(":")[0] if leader else self.environment.removesuffix("_v0")
 
 
+_ENDS, _FREE = ("free exploration", "exploration ends"), ("exploration ends", "and recent rewards")
 TASKS = (
-    StudyTask("consensus_v0", "paper", 2_000_000),
-    StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000),
-    StudyTask("leader_following_v0", "convoy", 1_500_000),
-    StudyTask("leader_following_v0", "mixed_fleet", 2_000_000),
+    StudyTask("consensus_v0", "paper", 2_000_000, (*CONTINUOUS, *NETWORKED, *_ENDS)),
+    StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000, (*CONTINUOUS, *NETWORKED, *_ENDS)),
+    StudyTask("leader_following_v0", "convoy", 1_500_000, (*CONTINUOUS, *NETWORKED, *_FREE)),
+    StudyTask("leader_following_v0", "mixed_fleet", 2_000_000, (*CONTINUOUS, *NETWORKED, *_FREE)),
     StudyTask("navigation_v0", "crossing", 2_000_000, tuple(NAVIGATION)),
 )
 
