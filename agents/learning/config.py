@@ -25,11 +25,8 @@ Backend = Literal["torch", "jax"]
 _FOR_JAX: Mapping[str, Any] = {"algorithm": "ppo", "policy": "mlp", "per_type": False, "critic": "local"}
 
 SUITED: Mapping[str, Mapping[str, Any]] = {
-    "sac": {"learning_rate": 1e-3, "batch_size": 512},
-    "recurrent": {"n_steps": 16},  # errors go back through memory as far as that
     "consensus_v0": {"gamma": 0.8, "learning_rate": 1e-3, "n_steps": 32, "batch_size": 4096},
     "leader_following_v0": {"log_std_end": 1.0, "reward_memory": 0},  # no limit
-    "attention": {"nearest": False},
     "navigation_v0": {
         "nearest": True,
         "intervention": 0.5,
@@ -46,8 +43,11 @@ SUITED: Mapping[str, Mapping[str, Any]] = {
         "reward_memory": 0,
         "arguments": {"penalty": 0.1, "goal_radius": 0.1},  # it learns to come nearer than it has to
     },
+    "sac": {"learning_rate": 1e-3, "batch_size": 512},
+    "attention": {"nearest": False},
+    "recurrent": {"n_steps": 16},  # errors go back through memory as far as that
 }
-"""By algorithm, kind of network and environment: settings where others than the defaults suit it."""
+"""By environment, algorithm and kind of network: settings where others than the defaults suit it; later ones win."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class TrainingConfig:
         if self.policy == "attention" and (self.per_type or self.nearest):
             name = "per_type" if self.per_type else "nearest"
             raise ValueError(
-                f"{name} is for policy 'mlp': attention treats all slots alike, by one network for all agents"
+                f"policy 'attention' doesn't go with {name}: it treats all slots alike, by one network for all agents"
             )
         if self.critic not in get_args(Critic):
             raise ValueError(f"critic must be one of {', '.join(get_args(Critic))}; got {self.critic!r}")
@@ -231,7 +231,7 @@ class TrainingConfig:
         """
         own = SUITED.get(environment, {}) if isinstance(environment, str) else {}
         algorithm, policy = (SUITED.get(str(settings.get(name)), {}) for name in ("algorithm", "policy"))
-        found = {**algorithm, **own, **policy, **settings}
+        found = {**own, **algorithm, **policy, **settings}
         arguments = {**own.get("arguments", {}), **settings.get("arguments", {})}
         return cls(environment, **{**found, "arguments": arguments})
 

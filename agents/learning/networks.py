@@ -112,14 +112,16 @@ def make_model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: s
     return model
 
 
-def require_recurrent(config: TrainingConfig) -> None:
-    """Refuse to train a recurrent policy without sb3-contrib.
+def require_installed(config: TrainingConfig) -> None:
+    """Refuse to train with what needs a package that isn't installed.
 
     Raises:
         ModuleNotFoundError: with what to install.
     """
     if config.policy == "recurrent" and importlib.util.find_spec("sb3_contrib") is None:
         raise ModuleNotFoundError(f"recurrent policies are trained with sb3_contrib: {how_to_install('rl')}")
+    if config.backend == "jax" and importlib.util.find_spec("jax") is None:
+        raise ModuleNotFoundError(f"backend 'jax' needs JAX: {how_to_install('jax')}")
 
 
 def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str | None) -> BaseAlgorithm:
@@ -142,8 +144,12 @@ def _model(config: TrainingConfig, env: VecEnv, types: Sequence[int], log: str |
     net["log_std_init"] = config.log_std
     if sees_state:
         net["state"] = net["features_extractor_kwargs"]["state"]
-    algorithm: Any = _ppo(config)
+    algorithm: Any = PPO
     policy: Any
+    if config.backend == "jax":
+        from agents.learning.jax_ppo import JaxPPO
+
+        algorithm = JaxPPO
     if config.policy == "recurrent":
         from agents.learning.recurrent import RecurrentPolicy, RecurrentPPO
 
@@ -188,21 +194,6 @@ def _extractor(config: TrainingConfig, env: VecEnv) -> dict[str, Any]:
         found["features_extractor_class"] = BesideState
         found["features_extractor_kwargs"] = {"state": wrapped.state.size, **arguments}
     return found
-
-
-def _ppo(config: TrainingConfig) -> type[PPO]:
-    """PPO with the run's backend.
-
-    Raises:
-        ModuleNotFoundError: if JAX is asked for and isn't installed.
-    """
-    if config.backend == "torch":
-        return PPO
-    try:
-        from agents.learning.jax_ppo import JaxPPO
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"backend 'jax' needs JAX: {how_to_install('jax')}") from error
-    return JaxPPO
 
 
 def _divisor(samples: int, wanted: int) -> int:

@@ -14,6 +14,7 @@ from agents.learning.callbacks import named_callbacks
 from agents.learning.config import TrainingConfig
 from agents.learning.curve import Evaluation, evaluation_environment
 from agents.learning.environment import build, described
+from agents.learning.networks import require_installed
 from agents.learning.residual import Script
 from agents.learning.run_folder import (
     CHECKPOINT,
@@ -67,10 +68,12 @@ def run_sweep(
             environment; before anything is trained.
         FileExistsError: if the folder holds runs and `resume` isn't set, or a sweep is running there.
         FileNotFoundError: if `resume` is set, and there is no run.
-        ModuleNotFoundError: if `ray` is set and Ray isn't installed.
+        ModuleNotFoundError: if `ray` is set and Ray isn't installed, or a training needs what isn't.
         Interrupted: on Ctrl-C; its `partial` is the result until then.
     """
     folder, runs = Path(out).resolve(), sweep.runs()
+    for run in runs:
+        require_installed(run.config)
     fingerprints = _checked(runs)
     for name in callbacks:
         load_object(name)  # each training makes its own

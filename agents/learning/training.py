@@ -26,7 +26,7 @@ from agents.learning.environment import TrainingVecEnv, described, training_envi
 from agents.learning.initial import begin_from
 from agents.learning.interrupts import Interrupts, StopError
 from agents.learning.learned import LearnedPolicy, columns_of
-from agents.learning.networks import exported, make_model, require_recurrent
+from agents.learning.networks import exported, make_model, require_installed
 from agents.learning.run_folder import (
     CHECKPOINT,
     alone_in,
@@ -92,12 +92,12 @@ def train(
         FileNotFoundError: if `resume` is set and there is no checkpoint.
         FileExistsError: if the folder holds a run and `resume` isn't set, or another training is running there.
         CheckpointError: if the checkpoint can't be read.
-        ModuleNotFoundError: for a recurrent policy without sb3-contrib.
+        ModuleNotFoundError: for a recurrent policy without sb3-contrib, or backend "jax" without JAX.
         ValueError: if environment or scenario is unknown, or a resumed run had other settings or another environment.
     """
     torch.set_num_threads(1)  # small networks don't gain from more
     folder = None if out is None else Path(out)
-    require_recurrent(config)
+    require_installed(config)
     own = OwnCallbacks(callbacks)
     asked, config = config, dataclasses.replace(config, scenario=chosen_scenario(config.environment, config.scenario))
     if folder is None or not (folder / CHECKPOINT).exists():

@@ -230,8 +230,8 @@ def test_it_trains_in_a_safety_filter():
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"per_type": True}, "per_type is for policy 'mlp'"),
-        ({"nearest": True}, "nearest is for policy 'mlp'"),
+        ({"per_type": True}, "policy 'attention' doesn't go with per_type"),
+        ({"nearest": True}, "policy 'attention' doesn't go with nearest"),
         ({"policy": "transformer"}, "policy must be one of mlp, attention, recurrent; got 'transformer'"),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.learning import LearnedPolicy, TrainingConfig, train
+from agents.learning import LearnedPolicy, Sweep, TrainingConfig, run_sweep, train
 from agents.learning.environment import training_environment
 from agents.learning.networks import make_model
 from tests.agents.training import SMALL
@@ -32,11 +32,14 @@ def test_other_combinations_are_refused(changes, said):
         TrainingConfig("consensus_v0", **changes)
 
 
-def test_without_jax_it_says_what_to_install(monkeypatch):
+def test_without_jax_it_says_what_to_install(tmp_path, monkeypatch):
+    """Before there is a folder; a sweep before anything is trained."""
     monkeypatch.setitem(sys.modules, "jax", None)
-    monkeypatch.delitem(sys.modules, "agents.learning.jax_ppo", raising=False)
-    with pytest.raises(ModuleNotFoundError, match=r"backend 'jax' needs JAX: .*pip install .*'\.\[jax\]'"):
-        train(JAX)
+    sweep = Sweep({"environment": "consensus_v0", "timesteps": 100}, {"backend": ["torch", "jax"]})
+    for begin in (lambda: train(JAX, tmp_path / "run"), lambda: run_sweep(sweep, tmp_path / "run")):
+        with pytest.raises(ModuleNotFoundError, match=r"backend 'jax' needs JAX: .*pip install .*'\.\[jax\]'"):
+            begin()
+        assert not (tmp_path / "run").exists()
 
 
 def updated(config, updates):

@@ -149,6 +149,12 @@ def test_settings_are_checked(changes, said):
         TrainingConfig("consensus_v0", **changes)
 
 
+def test_what_suits_an_algorithm_wins_over_what_suits_an_environment():
+    """Batches of the size that suits PPO in consensus would make each of SAC's gradient steps eight times as long."""
+    found = TrainingConfig.suited("consensus_v0", algorithm="sac")
+    assert (found.batch_size, found.gamma) == (512, TrainingConfig.suited("consensus_v0").gamma)
+
+
 def test_ctrl_c_on_the_command_line(tmp_path):
     command = [sys.executable, "-W", "ignore", "-m", "khop_env", "train", "consensus_v0", "--timesteps", "5000000"]
     command += ["--num-envs", "8", "--out", str(tmp_path / "run")]
