@@ -46,11 +46,11 @@ RANKS = [
 ]
 # Where a third-party package may be imported at all (architecture, last paragraph of the import order).
 HEAVY = {
-    "torch": ("agents", "benchmarks.peers"),  # the peers run in environments of their own
+    "torch": ("agents", "benchmarks.peers", "benchmarks.training"),  # the peers run in environments of their own
     "ray": ("agents",),
     "sb3_contrib": ("agents.learning.recurrent",),
     "stable_baselines3": ("agents", "khop_env.env.sb3", "khop_env.testing.libraries", "benchmarks.peers"),
-    "matplotlib": ("khop_env.results", "khop_env.env.rendering", "benchmarks.safety_film", "benchmarks.precision"),
+    "matplotlib": ("khop_env.results", "khop_env.env.rendering", "benchmarks.side_by_side", "benchmarks.precision"),
     "pygame": ("khop_env.env.rendering",),
     "imageio_ffmpeg": ("khop_env.results",),
 }

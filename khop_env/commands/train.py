@@ -63,7 +63,10 @@ def train(
     scenario: EnvironmentScenario = None,
     observe: Annotated[
         ObserveOption | None,
-        typer.Option(help="States of agents beyond the neighbours that it learns on; by default estimate."),
+        typer.Option(
+            metavar="MODE",
+            help="States of agents beyond the neighbours that it learns on: estimate (the default), oracle or local.",
+        ),
     ] = None,
     bounds: Annotated[
         bool | None, typer.Option("--bounds", help="Add the guaranteed bounds of the estimates to its observations.")
@@ -109,7 +112,8 @@ def train(
     ] = None,
     algo: Annotated[AlgorithmOption | None, typer.Option(help="Algorithm; by default ppo.")] = None,
     policy: Annotated[
-        PolicyOption | None, typer.Option(help="Kind of network; by default mlp. See the guide on training.")
+        PolicyOption | None,
+        typer.Option(metavar="KIND", help="Network: mlp (the default), attention or recurrent; see the guide."),
     ] = None,
     per_type: Annotated[bool | None, typer.Option("--per-type", help="One network for each type of agent.")] = None,
     critic: Annotated[
