@@ -45,7 +45,12 @@ def begin_from(source: str, model: BaseAlgorithm, new: LearnedPolicy, env: EnvDe
         if not whole:
             load_actor(model, policy.networks)
             return
-        restore_networks(model, read_checkpoint(folder / CHECKPOINT)["model"])
+        stored = read_checkpoint(folder / CHECKPOINT)["model"]
+        try:
+            restore_networks(model, stored)
+        except ValueError as error:  # a critic that sees the state of a fleet of another size
+            hint = f"name {folder / 'last.npz'}, of which the policy alone is taken"
+            raise PolicyFileError(f"its networks are of other sizes ({error}): {hint}") from error
     except (ValueError, KeyError, TypeError, OSError, RuntimeError) as error:
         raise ValueError(f"can't begin from {source}: {error}") from error
 

@@ -227,3 +227,15 @@ def test_a_local_critic_is_as_before():
     model = make_model(chosen, env, [], None)
     assert env.observation_space.shape == (env.venv.scaler.size,)
     assert model.policy.mlp_extractor.value_net[0].in_features == env.venv.scaler.size
+
+
+def test_a_fleet_of_another_size_takes_the_policy_alone(tmp_path):
+    """With attention the policy fits, but not the critic, which sees the state of the whole fleet."""
+    small = config("formation_v0", "random_geometric:agents=5", policy="attention", timesteps=100, evaluations=1)
+    train(small, tmp_path)
+    larger = dataclasses.replace(small, scenario="random_geometric:agents=7", initial=str(tmp_path))
+    with pytest.raises(ValueError, match=r"can't begin from .*its networks are of other sizes .*: name .*last\.npz"):
+        _Run(larger, None, None, None)
+    run = _Run(dataclasses.replace(larger, initial=str(tmp_path / "last.npz")), None, None, None)
+    ours, theirs = run.policy.networks[""].arrays(), LearnedPolicy.load(tmp_path / "last.npz").networks[""].arrays()
+    assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
