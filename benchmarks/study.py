@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from agents.learning.config import TrainingConfig
+from agents.learning.config import NO_LIMIT, TrainingConfig
 from agents.learning.config_file import read_config
 from khop_env.simulation import Observe
 
@@ -85,7 +85,7 @@ NAVIGATION: Mapping[str, Recipe] = {
     "shielded residual": Recipe((Play(inside=FILTER),), {"shield": SHIELD, **CAREFUL}),
     "not shielded": Recipe((Play(), Play(inside=FILTER))),
 }
-FREE: Mapping[str, Any] = {"log_std_end": 100.0, "explore": 0.0, "reward_memory": 0}
+FREE: Mapping[str, Any] = {"log_std_end": NO_LIMIT, "explore": 0.0, "reward_memory": 0}
 EXPLORATION: Mapping[str, Recipe] = {  # their learning curves are what is of interest; one of the three is "estimate"
     "free exploration": Recipe((), FREE, seeds=SEEDS[:3]),
     "exploration ends": Recipe((), {**FREE, "log_std_end": -3.0}, seeds=SEEDS[:3]),
@@ -253,6 +253,8 @@ def state_of(run: Run, root: Path) -> State:
     try:
         there = TrainingConfig(**read_config(folder / "config.toml")).as_dict()
         wanted["backend"] = there["backend"]  # the same results but for rounding
+        if all(each["log_std_end"] > each["log_std"] for each in (wanted, there)):
+            wanted["log_std_end"] = there["log_std_end"]  # neither is a limit
         differs = [f"{key} = {there[key]!r} and not {value!r}" for key, value in wanted.items() if there[key] != value]
     except (TypeError, ValueError) as error:
         differs = [str(error)]

@@ -25,6 +25,7 @@ NO_COLLISION = "shielded: no collision"
 ABOVE = "shielded: best return"
 ARRIVE = "shielded: most successes"
 THREE = "better on three tasks"
+NOT_YET = "not trained yet"
 AIMS = (WITHIN, AT_LEAST, ON_TOP, PAY, PAY_ATTENTION, NO_COLLISION, ABOVE, ARRIVE)
 """What is aimed at, in the order of the summary; `THREE` is counted from the others."""
 
@@ -81,7 +82,8 @@ def table(block: Block) -> Iterator[str]:
         yield "| policy | seeds | return | over seeds | IQM | collided % | success % | arrival (s) |"
         yield "|---|---|---|---|---|---|---|---|"
         for row in block.rows:
-            yield _cells(_inside(row), row, _outcomes(row))
+            if row.seeds:
+                yield _cells(_inside(row), row, _outcomes(row))
     else:
         yield f"In continuous exchange; bounds on estimates fall at {rates_of(block.task.scenario)} 1/s.\n"
         yield "| policy | seeds | return | over seeds | IQM | error at the end | largest \\|e\\|, late |"
@@ -96,7 +98,11 @@ def table(block: Block) -> Iterator[str]:
             on = (row.play.network or "").partition(":")[0]
             yield _cells(f"{_label(row, block)} | {on}", row, (_error(row), _most(row, "max_error_to_bound")))
     yield ""
+    if missing := dict.fromkeys(row.name for row in block.rows if not row.seeds):
+        yield f"Not trained yet: {', '.join(missing)}.\n"
     for finding in findings(block):
+        if finding.result == NOT_YET:
+            continue
         aim = f" (aim: {finding.aim}: {finding.verdict})" if finding.aim else ""
         yield f"- {finding.title}: {finding.result}{aim}"
     yield ""
@@ -172,7 +178,7 @@ def _navigation(block: Block) -> Iterator[Finding]:
             continue
         shielded = block.row(name, inside)
         if shielded is None:
-            yield Finding(f"{name}, collisions", "not trained yet", NO_COLLISION, "open: not trained yet")
+            yield Finding(f"{name}, collisions", NOT_YET, NO_COLLISION, "open: not trained yet")
         else:
             collided = shielded.values("collision")
             text = f"{int(collided.sum())} of {collided.size} episodes"
@@ -191,7 +197,7 @@ def _navigation(block: Block) -> Iterator[Finding]:
 def _compared(title: str, ours: Row | None, theirs: Row | None, aim: str, key: str = "returns") -> Finding:
     found = None if ours is None or theirs is None else difference(ours, theirs, key)
     if ours is None or found is None:
-        return Finding(title, "not trained yet", aim, "open: not trained yet", "")
+        return Finding(title, NOT_YET, aim, "open: not trained yet", "")
     half = f" ± {short(found.half)}" if math.isfinite(found.half) else ""
     brief = found.relative.removesuffix(" %") + half
     return Finding(title, str(found), aim, outcome_of(aim, found, _complete(ours)) if aim else "", brief)
@@ -230,7 +236,7 @@ def _shown(block: Block, plays: Sequence[Play], recipes: Container[str]) -> Iter
     for row in block.rows:
         if row.play in plays and not row.learned and row.name in ("tanh", "linear", *FLOORS, block.best(row.play).name):
             yield row
-    yield from (row for row in block.rows if row.learned and row.play in plays and row.name in recipes)
+    yield from (row for row in block.rows if row.seeds and row.learned and row.play in plays and row.name in recipes)
 
 
 def _label(row: Row, block: Block) -> str:
@@ -252,10 +258,8 @@ def _script(row: Row) -> str:
 
 
 def _cells(first: str, row: Row, rest: Sequence[str]) -> str:
-    """A line of a table; without runs it says so."""
+    """A line of a table."""
     seeds = f"{len(row.seeds)}/{len(SEEDS)}" if row.learned else ""
-    if not row.seeds:
-        return f"| {first} | {seeds} | " + " | ".join("" for _ in range(3 + len(rest))) + " |"
     returns = row.returns
     mean, over_episodes = returns.mean(), interval95(returns.mean(axis=0)) or 0.0
     over_seeds = interval95(returns.mean(axis=1))
@@ -270,17 +274,15 @@ def _cells(first: str, row: Row, rest: Sequence[str]) -> str:
 
 
 def _error(row: Row) -> str:
-    return f"{row.values('final_task_error').mean():.3g}" if row.seeds else ""
+    return f"{row.values('final_task_error').mean():.3g}"
 
 
 def _most(row: Row, key: str) -> str:
-    return f"{row.values(key).max():.3f}" if row.seeds else ""
+    return f"{row.values(key).max():.3f}"
 
 
 def _outcomes(row: Row) -> tuple[str, str, str]:
     """Collisions and successes with Wilson's intervals, of all seeds' episodes together, and the time of arrival."""
-    if not row.seeds:
-        return "", "", ""
     texts = []
     for key in ("collision", "success"):
         values = row.values(key).ravel()

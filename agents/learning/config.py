@@ -24,9 +24,12 @@ Critic = Literal["local", "state"]
 Backend = Literal["torch", "jax"]
 _FOR_JAX: Mapping[str, Any] = {"algorithm": "ppo", "policy": "mlp", "per_type": False, "critic": "local"}
 
+NO_LIMIT = 100.0
+"""A `log_std_end` above every `log_std`."""
+
 SUITED: Mapping[str, Mapping[str, Any]] = {
     "consensus_v0": {"gamma": 0.8, "learning_rate": 1e-3, "n_steps": 32, "batch_size": 4096},
-    "leader_following_v0": {"log_std_end": 1.0, "reward_memory": 0},  # no limit
+    "leader_following_v0": {"log_std_end": NO_LIMIT, "reward_memory": 0},
     "navigation_v0": {
         "nearest": True,
         "intervention": 0.5,
@@ -39,7 +42,7 @@ SUITED: Mapping[str, Mapping[str, Any]] = {
         "n_epochs": 5,
         "entropy": 0.003,
         "log_std": -0.5,
-        "log_std_end": 0.0,  # no limit
+        "log_std_end": NO_LIMIT,
         "reward_memory": 0,
         "arguments": {"penalty": 0.1, "goal_radius": 0.1},  # it learns to come nearer than it has to
     },

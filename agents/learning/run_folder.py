@@ -14,7 +14,7 @@ import filelock
 import khop_env
 from agents.evaluation import chosen_scenario
 from agents.learning.checkpoint import CheckpointError, read_checkpoint
-from agents.learning.config import TrainingConfig
+from agents.learning.config import NO_LIMIT, TrainingConfig
 from agents.learning.fingerprint import differences, fingerprint
 from agents.learning.residual import Script
 from khop_env.env import BatchedEnv
@@ -63,7 +63,7 @@ def load_checkpoint(folder: Path, config: TrainingConfig) -> dict[str, Any]:
         "residual": None,
         "initial": None,
         "policy": "mlp",
-        "log_std_end": 100.0,
+        "log_std_end": NO_LIMIT,
         "explore": 0.0,
         "reward_memory": 0,
         "evaluate_network": None,
