@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import signal
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from agents.learning.slots import SlotScaler
 from agents.learning.training import _Run, train
 from agents.policy import by_agent
 from khop_env import make_sb3_vec
-from tests.agents.training import SMALL
+from tests.agents.training import SMALL, resumed_as_uninterrupted
 from tests.env.playing import batched
 
 TINY = dataclasses.replace(
@@ -184,16 +183,7 @@ def test_what_does_not_fit_is_refused(fleet, environment, scenario, arguments, s
 @pytest.mark.parametrize("changes", [{}, {"residual": "formation"}], ids=["alone", "residual"])
 def test_resumed_it_goes_on_as_if_nothing_had_happened(changes, tmp_path):
     chosen = dataclasses.replace(FLEET, **changes, timesteps=3000, evaluations=2)
-    whole = train(chosen, tmp_path / "whole")
-
-    def interrupt(fraction, found):
-        if fraction > 0.5:
-            signal.raise_signal(signal.SIGINT)
-
-    assert not train(chosen, tmp_path / "cut", on_progress=interrupt).finished
-    assert train(chosen, tmp_path / "cut", resume=True).curve == whole.curve
-    one, other = (LearnedPolicy.load(tmp_path / name / "last.npz").networks[""].arrays() for name in ("whole", "cut"))
-    assert all(np.array_equal(one[name], other[name]) for name in one)
+    resumed_as_uninterrupted(chosen, tmp_path)
     with pytest.raises(ValueError, match="policy = 'attention' there and 'mlp' here"):
         train(dataclasses.replace(chosen, policy="mlp"), tmp_path / "cut", resume=True)
 

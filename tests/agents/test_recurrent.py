@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import signal
 import sys
 
 import numpy as np
@@ -21,6 +20,7 @@ from agents.learning.training import _Run, train
 from agents.policy import by_agent
 from khop_env.cli import app
 from khop_env.network import Network
+from tests.agents.training import resumed_as_uninterrupted
 from tests.deploy.test_policies import test_lockstep_equals_the_environment as lockstep
 
 torch.set_num_threads(1)  # as `train` does
@@ -143,19 +143,9 @@ def test_exploration_ends_on_schedule():
 )
 def test_resumed_it_goes_on_as_if_nothing_had_happened(environment, settings, tmp_path):
     chosen = config(environment, **settings)
-    whole = train(chosen, tmp_path / "whole")
-
-    def interrupt(fraction, found):
-        if fraction > 0.5:
-            signal.raise_signal(signal.SIGINT)
-
-    assert not train(chosen, tmp_path / "cut", on_progress=interrupt).finished
-    assert train(chosen, tmp_path / "cut", resume=True).curve == whole.curve
-    one, other = (LearnedPolicy.load(tmp_path / name / "last.npz").networks[""].arrays() for name in ("whole", "cut"))
-    assert set(one) >= {"lstm/from_inputs", "lstm/from_before", "lstm/bias"}
-    assert all(np.array_equal(one[name], other[name]) for name in one)
+    whole, last = resumed_as_uninterrupted(chosen, tmp_path)
+    assert set(last.networks[""].arrays()) >= {"lstm/from_inputs", "lstm/from_before", "lstm/bias"}
     if chosen.shield is None:  # the last evaluation begins without any memory
-        last = LearnedPolicy.load(tmp_path / "whole" / "last.npz")
         again = play(build(chosen, len(EVALUATION_SEEDS)), last, EVALUATION_SEEDS)
         assert again.returns.mean() == whole.curve[-1].mean_return
 

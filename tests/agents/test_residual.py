@@ -1,7 +1,6 @@
 """Residual learning: a network that adds to a script's actions."""
 
 import dataclasses
-import signal
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from agents.learning.residual import Script
 from agents.learning.training import _Run, train
 from agents.policies import POLICIES
 from agents.policy import by_agent, describe
+from tests.agents.training import resumed_as_uninterrupted
 
 TINY = {"num_envs": 4, "timesteps": 1500, "evaluations": 2, "batch_size": 128, "hidden": (16,)}
 SHORT = {"max_cycles": 20}
@@ -207,16 +207,7 @@ def _one(env, observations, number):
 )
 def test_resumed_it_goes_on_as_if_nothing_had_happened(environment, script, settings, tmp_path):
     chosen = config(environment, script, **settings)
-    whole = train(chosen, tmp_path / "whole")
-
-    def interrupt(fraction, found):
-        if fraction > 0.5:
-            signal.raise_signal(signal.SIGINT)
-
-    assert not train(chosen, tmp_path / "cut", on_progress=interrupt).finished
-    assert train(chosen, tmp_path / "cut", resume=True).curve == whole.curve
-    one, other = (LearnedPolicy.load(tmp_path / name / "last.npz").networks[""].layers for name in ("whole", "cut"))
-    assert all(np.array_equal(a, b) for pair in zip(one, other, strict=True) for a, b in zip(*pair, strict=True))
+    resumed_as_uninterrupted(chosen, tmp_path)
     with pytest.raises(ValueError, match=r"residual = '.*' there and None here; resume with the same"):
         train(dataclasses.replace(chosen, residual=None), tmp_path / "cut", resume=True)
 
