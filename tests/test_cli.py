@@ -56,7 +56,7 @@ class TestList:
         found = khop("list").stdout
         for name in ("paper", "mixed_fleet", "random_geometric", "agents=100", "leader_following_v0"):
             assert name in found
-        assert re.search(r"leader_following_convoy_lossy +leader_following_v0 +convoy +lossy:loss=0.3,burst=5", found)
+        assert re.search(r"leader_following_convoy_lossy +convoy +lossy:loss=0.3,burst=5", found)
 
     def test_json(self):
         found = only_json(khop("list", "--json"))

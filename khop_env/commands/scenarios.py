@@ -58,8 +58,8 @@ def list_scenarios(
     )
     print_text(f"environments: {', '.join(ENVIRONMENTS)}")
     print_table(
-        ("ppo:pretrained/", "environment", "scenario", "network"),
-        [(each["name"], each["environment"], each["scenario"], each["network"] or "") for each in policies],
+        ("ppo:pretrained/", "scenario", "network"),  # their names say the environment
+        [(each["name"], each["scenario"], each["network"] or "") for each in policies],
     )
 
 

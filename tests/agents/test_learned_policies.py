@@ -18,6 +18,7 @@ from agents.learning import (
 )
 from agents.learning.environment import training_environment
 from agents.learning.networks import make_model
+from agents.learning.slots import SlotScaler
 from agents.policy import by_agent
 from khop_env.cli import app
 from khop_env.env import ObservationLayout
@@ -90,6 +91,9 @@ def test_scales_are_found_by_name(path):
     over = {name: policy.about.get("arguments", {}).get(name) for name in ("network", "estimator")}
     env = batched(policy.environment, policy.about["scenario"], num_envs=2, **over)
     description = describe(env)
+    if isinstance(policy.scaler, SlotScaler):  # the order is tested in test_attention.py
+        assert same(SlotScaler.of(description, policy.about["rates"]).one, policy.scaler.one)
+        return
     chosen = {"rates": policy.about["rates"], "nearest": policy.about.get("nearest", False)}
     scaler = ObservationScaler.of(description, **chosen)
     assert same(scaler, policy.scaler)

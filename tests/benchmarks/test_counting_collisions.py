@@ -5,7 +5,7 @@ import json
 import pytest
 from PIL import Image
 
-from benchmarks import safety, safety_film, safety_table
+from benchmarks import safety, safety_film, safety_table, side_by_side
 
 
 @pytest.fixture(scope="module")
@@ -63,13 +63,13 @@ def test_a_film_of_both(tmp_path, monkeypatch):
     path = tmp_path / "film.gif"
     monkeypatch.setattr("sys.argv", ["safety_film", str(path), "--scenario", "swap:duration=2.5", "--observer", "7"])
     counts = []
-    step = safety_film.Half.step
+    step = side_by_side.Side.step
     monkeypatch.setattr(
-        safety_film.Half, "step", lambda half: (step(half), counts.append((half.title, half.collisions)))
+        side_by_side.Side, "step", lambda side: (step(side), counts.append((side.title, side.collisions)))
     )
     safety_film.main()
     with Image.open(path) as film:
-        assert film.size == (1036, 480)
+        assert film.size == (1034, 480)
         assert film.n_frames >= 25
     assert dict(counts) == {"filter on point estimates": 2, "filter on certified bounds": 0}
 
