@@ -83,6 +83,7 @@ def test_what_an_invalid_slot_holds_has_no_influence(content):
     each[:10, :, 0] = 0.0
     spoilt = each.copy()
     spoilt[..., 1:][each[..., 0] == 0.0] = content
+    torch.manual_seed(0)  # with other weights a row's units may all be inactive
     extractor = SlotAttention(Box(-1.0, 1.0, (45,)), 5, 10, width=8, heads=2)
     for found in (
         lambda slots: outputs(network, own, slots),
