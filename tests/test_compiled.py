@@ -269,7 +269,8 @@ def test_python_collects_no_garbage_while_kernels_compile():
 
     with event.install_listener("numba:compile", Seen()):
         outer(1.0)
-    assert seen and not any(seen[:-1])  # both begin, then the inner one ends, unless an earlier run has kept it
+    assert seen
+    assert not any(seen[:-1])  # both begin, then the inner one ends, unless an earlier run has kept it
     assert gc.isenabled()
     with pytest.raises(numba.TypingError):
         wrong(1)
