@@ -15,6 +15,7 @@ import numpy as np
 
 import khop_env
 from agents.comparison import compare
+from agents.learning.archive import write_arrays
 from agents.tuned import PATH as TUNED
 from agents.workers import UnfinishedError
 from benchmarks.study import CONTINUOUS, FILTER, NETWORKS, RECIPES, SCRIPTS, SEEDS, Play, Run, StudyTask
@@ -226,11 +227,7 @@ def _play(job: _Job) -> str:
         return f"can't be played on {job.play}: {error}"
     episodes = compared.rows[0].episodes
     values = {key: getattr(episodes, key) for key in KEPT} | dict(episodes.outcomes)
-    path = _path(job.root, job.key)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.part.npz")
-    np.savez(partial, **values)
-    partial.replace(path)
+    write_arrays(_path(job.root, job.key), values, compress=False)
     return ""
 
 

@@ -189,9 +189,10 @@ class _Run(BaseCallback):
         """Save the policy of a training that doesn't come to its end."""
         if self.folder is None or not (self.folder / CHECKPOINT).exists():  # it hadn't begun
             return
-        self._exported().save(self.folder / "last.npz")
+        policy = self._exported()
+        policy.save(self.folder / "last.npz")
         if not (self.folder / "best.npz").exists():
-            self._exported().save(self.folder / "best.npz")
+            policy.save(self.folder / "best.npz")
 
     def elapsed(self) -> float:
         """Seconds of training so far."""
