@@ -9,6 +9,8 @@ from typing import Any
 from agents.policy import EnvDescription
 
 PATH = Path(__file__).with_name("tuned.toml")
+OVER = "random"
+"""Networks over which parameters for networks are found: drawn anew in every episode."""
 
 
 def _table() -> dict[str, Any]:
@@ -19,16 +21,28 @@ def tuned_parameters(env: EnvDescription, law: str) -> dict[str, Any]:
     """The shipped parameters of a law; empty if there are none.
 
     Parameters for the scenario take precedence over those for another member of its family ("random_geometric:...").
-    One set is for the modes "estimate" and "oracle", another for "local".
 
     Args:
-        env: provides environment, scenario and observation mode.
+        env: provides environment, scenario, observation mode, and whether there is a network.
         law: name of the law.
     """
     scenarios, family = _table().get(env.environment, {}), env.scenario.partition(":")[0]
     relatives = [name for name in scenarios if name.partition(":")[0] == family]
     laws = scenarios[env.scenario if env.scenario in scenarios else relatives[0]] if relatives else {}
-    return dict(laws.get(law, {}).get("local" if env.observe == "local" else "estimate", {}))
+    sets = laws.get(law, {})
+    return dict(sets.get(tuned_for(env), sets.get("estimate", {})))
+
+
+def tuned_for(env: EnvDescription) -> str:
+    """Which set of parameters is for an environment: "local" for neighbours only, "network" for estimates from
+    messages, of which all are late, else "estimate", for true states, too.
+
+    Args:
+        env: provides observation mode and network.
+    """
+    if env.observe == "estimate" and env.network is not None:
+        return "network"
+    return "local" if env.observe == "local" else "estimate"
 
 
 def sampled_gain(gain: float, averages: bool, env: EnvDescription) -> float:

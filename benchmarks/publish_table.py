@@ -24,6 +24,7 @@ from typing import Any, get_args
 from agents.learning import TrainingConfig
 from agents.learning.config import Backend
 from agents.learning.run_folder import write
+from agents.tuned import OVER
 from agents.workers import Interrupted
 from benchmarks.publish import commit
 from benchmarks.study import (
@@ -227,6 +228,7 @@ def _method(tasks: Sequence[StudyTask], episodes: int) -> Iterator[str]:
     yield "|---|---|---|---|"
     for name, recipe in RECIPES.items():
         settings = ", ".join(f"`{key}={value}`" for key, value in recipe.settings.items())
+        settings += "".join(f"bounds fall at {play.rate:g} 1/s" for play in recipe.plays if play.rate is not None)
         where = "all others" if name not in NAVIGATION else "navigation"
         network = f"`{recipe.network}`" if recipe.network else "its scenario's network" if where == "navigation" else ""
         yield f"| {name} | {settings} | {network or 'continuous exchange'} | {where} |"
@@ -244,10 +246,10 @@ def _method(tasks: Sequence[StudyTask], episodes: int) -> Iterator[str]:
     )
     yield (
         "Scripts, of which the best is in bold, have the parameters that `khop tune` found for environment and "
-        "scenario in continuous exchange, on estimates (used on true states and over networks, too) or on neighbours "
-        "only. `khop tune --env network=...` would tune over a network; that wasn't done. Differences are paired by "
-        "episode and seed: better or worse is said only where the intervals over episodes and over training seeds "
-        "both exclude 0, level where they don't "
+        "scenario: in continuous exchange on estimates (used on true states, too), on neighbours only, and on "
+        f"estimates over `{OVER}` networks, used over all three. Differences are paired by episode and seed: better "
+        "or worse is said only where the intervals over episodes and over training seeds both exclude 0, level where "
+        "they don't "
         f"but stay within 3 %. The wider of both is in the summary. {_estimators(tasks)}\n"
     )
     yield (

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from agents.learning.config import NO_LIMIT, TrainingConfig
 from agents.learning.config_file import read_config
+from khop_env.registry import scenario as by_name
+from khop_env.scenarios import Scenario
 from khop_env.simulation import Observe
 
 SEEDS = range(5)
@@ -24,6 +26,7 @@ NETWORKS = ("ideal", "wifi", LOSSY)
 RANDOM = "random"  # networks that are drawn anew in every episode
 SHIELD = "certified,announce=true"
 FILTER = "filter:announce=true"  # the same filter around a policy that is played
+FAST = 20.0  # 1/s, at which bounds on estimates fall where it is tried whether that pays
 
 
 class Play(NamedTuple):
@@ -33,11 +36,13 @@ class Play(NamedTuple):
         observe: observation mode.
         network: None for the environment's own, which is continuous exchange but in navigation.
         inside: name of a safety filter around it; "" for none.
+        rate: at which bounds on estimates fall in 1/s; None for the scenario's.
     """
 
     observe: Observe = "estimate"
     network: str | None = None
     inside: str = ""
+    rate: float | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,7 @@ CONTINUOUS: Mapping[str, Recipe] = {
     "oracle": Recipe((Play("oracle"), Play("estimate")), {"observe": "oracle"}),
     "local": Recipe((Play("local"),), {"observe": "local"}),
     "estimate + bounds": Recipe(settings={"bounds": True}),
+    "faster bounds": Recipe((Play(rate=FAST),)),
     "residual": Recipe(settings={"residual": "leader_following"}),  # the best tuned script on all four tasks
 }
 NETWORKED: Mapping[str, Recipe] = {
@@ -111,6 +117,10 @@ class StudyTask:
     timesteps: int
     recipes: Sequence[str] = (*CONTINUOUS, *NETWORKED)
 
+    def where(self, rate: float | None) -> str | Scenario:
+        """The scenario, its bounds falling at another rate in 1/s, unless that is None."""
+        return self.scenario if rate is None else _falling(by_name(self.scenario), rate)
+
     @property
     def label(self) -> str:
         """Name in titles."""
@@ -123,12 +133,28 @@ class StudyTask:
         return self.scenario.partition(":")[0] if leader else self.environment.removesuffix("_v0")
 
 
+def _falling(found: Scenario, rate: float) -> Scenario:
+    """A scenario whose bounds fall at another rate, with the same final values."""
+
+    def falling(bounds: Any) -> Any:
+        if isinstance(bounds, Mapping):
+            return {key: falling(value) for key, value in bounds.items()}
+        if isinstance(bounds, list | tuple):
+            return [falling(value) for value in bounds]
+        return bounds and replace(bounds, rate=rate)
+
+    name = f"{found.name}{',' if ':' in found.name else ':'}rate={rate:g}"
+    return found.replace(name=name, delta=falling(found.delta), theta=falling(found.theta)).sized()
+
+
 _ENDS, _FREE = ("free exploration", "exploration ends"), ("exploration ends", "and recent rewards")
+_ALL = (*CONTINUOUS, *NETWORKED)
+_CONVOY = tuple(name for name in _ALL if name != "faster bounds")  # they fall at 15 1/s
 TASKS = (
-    StudyTask("consensus_v0", "paper", 2_000_000, (*CONTINUOUS, *NETWORKED, *_ENDS)),
-    StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000, (*CONTINUOUS, *NETWORKED, *_ENDS)),
-    StudyTask("leader_following_v0", "convoy", 1_500_000, (*CONTINUOUS, *NETWORKED, *_FREE)),
-    StudyTask("leader_following_v0", "mixed_fleet", 2_000_000, (*CONTINUOUS, *NETWORKED, *_FREE)),
+    StudyTask("consensus_v0", "paper", 2_000_000, (*_ALL, *_ENDS)),
+    StudyTask("formation_v0", "random_geometric:agents=12", 1_000_000, (*_ALL, *_ENDS)),
+    StudyTask("leader_following_v0", "convoy", 1_500_000, (*_CONVOY, *_FREE)),
+    StudyTask("leader_following_v0", "mixed_fleet", 2_000_000, (*_ALL, *_FREE)),
     StudyTask("navigation_v0", "crossing", 2_000_000, tuple(NAVIGATION)),
 )
 
@@ -174,7 +200,8 @@ class Run(NamedTuple):
             ValueError: if a value is invalid.
         """
         recipe = RECIPES[self.recipe]
-        settings = {**recipe.settings, "scenario": self.task.scenario, "timesteps": self.task.timesteps}
+        rate = recipe.plays[0].rate if recipe.plays else None
+        settings = {**recipe.settings, "scenario": self.task.where(rate), "timesteps": self.task.timesteps}
         if recipe.network is not None:
             settings["arguments"] = {"network": recipe.network}
         return TrainingConfig.suited(self.task.environment, seed=self.seed, **settings)

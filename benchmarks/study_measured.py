@@ -174,7 +174,9 @@ def _scripts(task: StudyTask) -> list[tuple[str, Play]]:
         return [*inside, ("keep_right", Play()), ("go_to_goal", Play())]
     continuous = [(name, Play(observe)) for observe in OBSERVE for name in SCRIPTS]
     floors = [(name, Play()) for name in FLOORS] if set(task.recipes) & set(CONTINUOUS) else []
-    return [*continuous, *floors, *((name, Play(network=network)) for network in NETWORKS for name in SCRIPTS)]
+    others = [Play(network=network) for network in NETWORKS]
+    others += [play for name in task.recipes for play in RECIPES[name].plays if play.rate is not None]
+    return [*continuous, *floors, *((name, play) for play in others for name in SCRIPTS)]
 
 
 def _planned(
@@ -196,7 +198,7 @@ def _planned(
         "network": play.network,
         "episodes": list(episodes),
         "version": khop_env.__version__,
-    }
+    } | ({} if play.rate is None else {"rate": play.rate})
     key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:32]
     plan[key] = _Job(root, task, spec, play, tuple(episodes), key)
     return key
@@ -219,7 +221,7 @@ def _play(job: _Job) -> str:
             job.task.environment,
             [job.name],
             [job.play.observe],
-            scenario=job.task.scenario,
+            scenario=job.task.where(job.play.rate),
             seeds=job.episodes,
             networks=networks,
         )

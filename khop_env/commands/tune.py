@@ -39,6 +39,7 @@ def tune(
 ) -> None:
     """Tune scripted policies and print their parameters as TOML, in the form of agents/tuned.toml.
 
+    With --env network=NAME estimates are those over this network, and their parameters are printed as "network".
     Each line is printed when its search ends; after an interrupt, the last line has the best parameters so far.
 
     Margins of policies that keep apart: the smallest without a collision in the tuning episodes, or up to 1 m the one
@@ -47,6 +48,8 @@ def tune(
     losses come in bursts agents collide, or stand still.
     """
     from agents.laws import LAWS
+    from agents.policy import describe
+    from agents.tuned import OVER, tuned_for
     from agents.tuning import SEEDS, tune, tune_margin
     from agents.workers import Interrupted
     from khop_env.env import Settings
@@ -78,21 +81,23 @@ def tune(
         for task in tasks:
             for where in SHIPPED if everything else [scenario or task.default_scenario]:
                 made = load(where)
-                envs = [make_batched(task, made, num_envs=len(SEEDS), observe=mode, **arguments) for mode in modes]
+                settings = [{**arguments, "observe": mode} for mode in modes]
+                if everything and "network" not in arguments:
+                    settings.append({**arguments, "network": OVER})
+                envs = [make_batched(task, made, num_envs=len(SEEDS), **each) for each in settings]
                 played = envs[0].task.environment
                 for name in names:
                     typer.echo(f'\n[{played}."{envs[0].scenario}".{name if name in LAWS else json.dumps(name)}]')
-                    for mode, batched in zip(modes, envs, strict=True):
-                        interrupted = False
+                    for batched in envs:
+                        mode, interrupted = batched.settings.observe, False
+                        over = name in LAWS and tuned_for(describe(batched)) == "network"
+                        label = f"{played} on {where}, {name} on {mode}{' over a network' * over}"
                         try:
-                            with Progress(f"{played} on {where}, {name} on {mode}") as progress:
+                            with Progress(label) as progress:
                                 best = (tune if name in LAWS else tune_margin)(batched, name, progress=progress)
                         except Interrupted as error:
                             best, interrupted = error.partial, True
-                        say(
-                            f"{played} on {where}, {name} on {mode}: {best.default_return:.4g} -> "
-                            f"{best.mean_return:.4g} in {best.trials} trials"
-                        )
+                        say(f"{label}: {best.default_return:.4g} -> {best.mean_return:.4g} in {best.trials} trials")
                         pairs = (f"{key} = {json.dumps(value)}" for key, value in best.parameters.items())
                         rates = ""
                         if best.collision_rate is not None and best.success_rate is not None:
@@ -100,7 +105,8 @@ def tune(
                                 round(rate * len(SEEDS)) for rate in (best.collision_rate, best.success_rate)
                             )
                             rates = f"  # {collided} of {len(SEEDS)} collided, {succeeded} succeeded"
-                        typer.echo(f"{mode} = {{ {', '.join(pairs)} }}{rates}{'  # interrupted' * interrupted}")
+                        kind = "network" if over else mode
+                        typer.echo(f"{kind} = {{ {', '.join(pairs)} }}{rates}{'  # interrupted' * interrupted}")
                         if interrupted:
                             say("khop: interrupted; above are the parameters that were found until then")
                             raise typer.Exit(INTERRUPTED)

@@ -13,6 +13,7 @@ from benchmarks import publish_table, study_measured
 from benchmarks.study import (
     DONE,
     EXPLORATION,
+    FAST,
     FILTER,
     LOSSY,
     RECIPES,
@@ -28,7 +29,9 @@ from benchmarks.study import runs as runs_of
 from benchmarks.study_measured import KEPT, Block, Row
 from benchmarks.study_statistics import Difference, difference, iqm, iqm95
 from benchmarks.study_table import AT_LEAST, PAY, WITHIN, findings, outcome_of, summary, table
+from khop_env.registry import scenario
 from khop_env.results import learning_curves
+from khop_env.scenarios import Scenario
 
 TINY = (
     StudyTask("consensus_v0", "paper", 4000, ("estimate", "oracle", "ideal")),
@@ -124,13 +127,15 @@ def test_the_aims_of_a_task():
         row("estimate", Play(), noise - 9.5),
         row("oracle", Play("oracle"), noise[::-1] - 9.0),
         row("oracle", Play(), noise - 9.7),
+        row("faster bounds", Play(rate=FAST), noise - 9.1),
+        *scripted(Play(rate=FAST), -9.5),
         Row("residual", Play(), (), (), True),
         row("lossy", lossy, noise - 18.0),
         row("lossy + bounds", lossy, noise[::-1] - 17.0),
         row("ideal", lossy, noise - 19.0),
         row("ideal", ideal, noise - 19.0),
     ]
-    block = Block(StudyTask("leader_following_v0", "convoy", 1), rows)
+    block = Block(StudyTask("leader_following_v0", "mixed_fleet", 1), rows)
     found = {finding.title: finding for finding in findings(block)}
     text = "learned on estimates, against "
     assert found[text + "learned on the truth"].verdict == "missed by 2.6 %"  # -0.5 / 9, and 3 % are allowed
@@ -148,8 +153,13 @@ def test_the_aims_of_a_task():
     assert "| linear, on oracle |  | -10 ± 0 |" in lines
     columns = [line.count("|") - line.count("\\|") - 1 for line in lines.splitlines() if line.startswith("|")]
     assert set(columns) == {7, 8}
-    assert "| within 3 % of the truth | convoy | **missed** by 2.6 % | -5.6 ± " in "\n".join(summary([block]))
-    assert "| better on three tasks | convoy | **missed** by 2 | 1 of 1 |" in "\n".join(summary([block]))
+    assert found["with bounds that fall at 20 1/s, against learned on the truth"].verdict == "reached"
+    itself = "tanh on estimates{}, against itself on the truth"
+    assert "(-11 %)" in found[itself.format("")].result
+    assert "(-5.6 %)" in found[itself.format(", bounds at 20 1/s")].result
+    assert "| **tanh**, on estimate, bounds at 20 1/s |  | -9.5 ± 0 |" in lines
+    assert "| within 3 % of the truth | mixed_fleet | **missed** by 2.6 % | -5.6 ± " in "\n".join(summary([block]))
+    assert "| better on three tasks | mixed_fleet | **missed** by 2 | 1 of 1 |" in "\n".join(summary([block]))
 
 
 @pytest.mark.parametrize(("collided", "verdict"), [(0, "reached"), (1, "missed")])
@@ -195,7 +205,11 @@ def test_settings_of_the_trainings():
     for run in runs_of(seeds=[2]):
         recipe = RECIPES[run.recipe]
         config = run.config()
-        assert (config.seed, config.timesteps, config.scenario) == (2, run.task.timesteps, run.task.scenario)
+        assert (config.seed, config.timesteps) == (2, run.task.timesteps)
+        if run.recipe == "faster bounds":
+            assert str(config.as_dict()["scenario"]).endswith("rate=20")
+        else:
+            assert config.scenario == run.task.scenario
         assert config.arguments.get("network") == recipe.network
         if run.recipe in EXPLORATION:
             continue
@@ -204,6 +218,20 @@ def test_settings_of_the_trainings():
     assert Run(TASKS[-1], "shielded", 0).config() == TrainingConfig.suited(
         "navigation_v0", scenario="crossing", shield="certified,announce=true", timesteps=TASKS[-1].timesteps
     )
+
+
+def test_only_the_rates_of_the_bounds_are_others():
+    for task in TASKS[:4]:
+        own, faster = scenario(task.scenario), task.where(FAST)
+        assert isinstance(faster, Scenario)
+        assert faster.name.rpartition("=")[2] == "20"
+        for kind in ("states", "inputs"):
+            ours, theirs = (getattr(each.design, kind).bounds for each in (own, faster))
+            assert [bound.final for bound in ours] == [bound.final for bound in theirs]
+            assert {bound.rate for bound in theirs} in ({FAST}, {FAST} if kind == "states" else set())
+        assert faster.disturbance == own.disturbance
+        assert np.array_equal(faster.initial.radius, own.initial.radius)
+        assert task.where(None) == task.scenario
 
 
 @pytest.mark.parametrize("text", [None, "", "12", "{}", '{"seconds": "long", "commit": ""}', '{"seconds": 1.5'])
