@@ -123,6 +123,10 @@ def test_tune():
     assert result.stdout.startswith("# Found by khop tune consensus_v0, on 64 episodes")
     assert '[consensus_v0."paper".tanh]\nestimate = { gain = ' in result.stdout
     assert "tanh on estimate: -" in result.stderr
+    over = "--observe", "estimate", "--env", "network=wifi", "--env", "max_cycles=10"
+    result = khop("tune", "consensus_v0", "--policies", "tanh", *over)
+    assert '[consensus_v0."paper".tanh]\nnetwork = { gain = ' in result.stdout
+    assert "tanh on estimate over a network: -" in result.stderr
     assert "name one environment" in khop("tune", status=2).stderr
     assert "no law 'tan'" in khop("tune", "consensus_v0", "--policies", "tan", status=2).stderr
 
