@@ -19,6 +19,7 @@ from khop_env.simulation import OBSERVE
 
 WITHIN = f"within {LEVEL:g} % of the truth"
 WITHIN_FAST = f"the same, bounds falling at {FAST:g} 1/s"
+WITHIN_SWAPPED = "the same, trained on the truth and played on estimates"
 AT_LEAST = "level with the best script"
 ON_TOP = "residual: level with the best script"
 PAY = "bounds pay, MLP"
@@ -28,7 +29,7 @@ ABOVE = "shielded: best return"
 ARRIVE = "shielded: most successes"
 THREE = "better on three tasks"
 NOT_YET = "not trained yet"
-AIMS = (WITHIN, WITHIN_FAST, AT_LEAST, ON_TOP, PAY, PAY_ATTENTION, NO_COLLISION, ABOVE, ARRIVE)
+AIMS = (WITHIN, WITHIN_SWAPPED, WITHIN_FAST, AT_LEAST, ON_TOP, PAY, PAY_ATTENTION, NO_COLLISION, ABOVE, ARRIVE)
 """What is aimed at, in the order of the summary; `THREE` is counted from the others."""
 
 
@@ -148,6 +149,8 @@ def findings(block: Block) -> Iterator[Finding]:
     yield against(
         "learned on estimates, against learned on the truth", "estimate", here, "oracle", WITHIN, Play("oracle")
     )
+    title = "trained on the truth: played on estimates, against played on the truth"
+    yield against(title, "oracle", here, "oracle", WITHIN_SWAPPED, Play("oracle"))
     if "faster bounds" in block.task.recipes:
         title = f"with bounds that fall at {FAST:g} 1/s, against learned on the truth"
         yield against(title, "faster bounds", Play(rate=FAST), "oracle", WITHIN_FAST, Play("oracle"))
@@ -223,7 +226,7 @@ def outcome_of(aim: str, found: Difference, complete: bool) -> str:
     if found.over_seeds is None:
         return "open: one seed"
     low, high = found.percent - found.half, found.percent + found.half
-    if aim in (WITHIN, WITHIN_FAST):
+    if aim in (WITHIN, WITHIN_SWAPPED, WITHIN_FAST):
         if high < -LEVEL:
             return f"missed by {short(-LEVEL - found.percent)} %"
         return "reached" if low > -LEVEL else "open"

@@ -153,6 +153,8 @@ def test_the_aims_of_a_task():
     assert "| linear, on oracle |  | -10 ± 0 |" in lines
     columns = [line.count("|") - line.count("\\|") - 1 for line in lines.splitlines() if line.startswith("|")]
     assert set(columns) == {7, 8}
+    swapped = found["trained on the truth: played on estimates, against played on the truth"]
+    assert swapped.verdict == "missed by 4.8 %"  # -0.7 / 9
     assert found["with bounds that fall at 20 1/s, against learned on the truth"].verdict == "reached"
     itself = "tanh on estimates{}, against itself on the truth"
     assert "(-11 %)" in found[itself.format("")].result
