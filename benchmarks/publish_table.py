@@ -54,8 +54,9 @@ AIMED = (
     "against learned on true states. *Level with the best script*: learned on estimates is at least level with the "
     "best of the tuned scripts on estimates; *better on three tasks*: clearly better. The same for *residual* "
     "policies, which act on top of `leader_following`. *Bounds pay*: over a lossy network, certificates in the "
-    "observation make returns better. *Shielded*: trained and played in the certified filter, against the better of "
-    "`keep_right` and `go_to_goal` in the same filter.\n"
+    "observation, beside the ages that are there in any case, make returns better. *Shielded*: trained and played in "
+    "the certified filter, against the better of `keep_right` and `go_to_goal` in the same filter. [What the misses "
+    "come from](#what-the-misses-come-from) is at the end.\n"
 )
 EXPLORING_FIGURE = [*FIGURES][-1]
 EXPLORING = """## Exploration and the unit of rewards

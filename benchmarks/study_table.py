@@ -177,9 +177,9 @@ def findings(block: Block) -> Iterator[Finding]:
     yield against("played lossy: trained on random networks, against trained lossy", "random", lossy, "lossy")
     yield against("played lossy: trained on random networks, against trained ideal", "random", lossy, "ideal")
     yield against("played lossy: attention, against an MLP", "lossy attention", lossy, "lossy")
-    for name in ("ideal", "wifi", "lossy"):
-        reference = block.best(on[name])
-        yield against(f"{name}, against the best script there ({reference.name})", name, on[name], reference)
+    for name in ("ideal", "wifi", "lossy", "lossy attention"):
+        reference = block.best(on[name.partition(" ")[0]])
+        yield against(f"{name}, against the best script there ({reference.name})", name, reference.play, reference)
 
 
 def _navigation(block: Block) -> Iterator[Finding]:
