@@ -57,7 +57,7 @@ class Difference:
     Attributes:
         mean: of the differences.
         over_episodes: half width of the 95 % interval over episodes, after averaging over seeds.
-        over_seeds: the same over training seeds; None for a single one.
+        over_seeds: the same over training seeds; None for a single one, 0 for scripts.
         reference: mean of the other row.
     """
 
@@ -96,7 +96,7 @@ class Difference:
         return "level" if abs(self.percent) + self.half < LEVEL else "no clear difference"
 
     def __str__(self) -> str:
-        over_seeds = "" if self.over_seeds is None else f", ± {short(self.over_seeds)} over training seeds"
+        over_seeds = f", ± {short(self.over_seeds)} over training seeds" if self.over_seeds else ""
         intervals = f"± {short(self.over_episodes)} over episodes{over_seeds}"
         return f"{'+' if self.mean >= 0.0 else ''}{short(self.mean, 3)} {intervals} ({self.relative}): {self.word}"
 
@@ -108,8 +108,8 @@ def difference(ours: Row, theirs: Row, key: str = "returns") -> Difference | Non
     """By how much a measurement of ours is larger; None if two learned rows have no seed in common.
 
     Args:
-        ours: a learned row.
-        theirs: a learned row, of which the seeds in both are compared, or a script's.
+        ours: a learned row, or a script's.
+        theirs: likewise; of two learned rows the seeds in both are compared.
         key: name of the measurement.
     """
     seeds = [seed for seed in ours.seeds if not theirs.learned or seed in theirs.seeds]
@@ -121,6 +121,6 @@ def difference(ours: Row, theirs: Row, key: str = "returns") -> Difference | Non
     return Difference(
         float(more.mean()),
         math.inf if over_episodes is None else over_episodes,
-        interval95(more.mean(axis=1)),
+        interval95(more.mean(axis=1)) if ours.learned else 0.0,
         float(other.mean()),
     )

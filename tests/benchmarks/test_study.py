@@ -106,6 +106,8 @@ def test_differences_are_of_common_seeds():
     assert difference(ours, row("b", Play(), [[0.0, 0.0]], seeds=(1,))) is None
     script = row("tanh", Play(), [[0.0, 1.0]], learned=False)
     assert difference(ours, script).mean == 2.0  # with all seeds
+    other = difference(row("tanh", Play(), [[-2.0, -1.5]], learned=False), script)
+    assert str(other) == "-2.25 ± 3.2 over episodes (-450 %): no clear difference"  # 12.7 times 0.25
 
 
 def scripted(play, value):
