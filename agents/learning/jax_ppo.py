@@ -67,7 +67,7 @@ class JaxPPO(PPO):
         corrections = np.stack([1 - _BETAS[0] ** steps, np.sqrt(1 - _BETAS[1] ** steps)], axis=1)
         constants = policy.optimizer.param_groups[0]["lr"], clip, self.ent_coef, self.vf_coef, self.max_grad_norm
         kept = [tensors, *([state[tensor][name] for tensor in tensors] for name in _MOMENTS)]
-        before = tuple(structure.unflatten([tensor.detach().numpy() for tensor in part]) for part in kept)
+        before = tuple(jax.tree.unflatten(structure, [tensor.detach().numpy() for tensor in part]) for part in kept)
         after, logged = _update(
             before, samples, batches.astype(np.int32), corrections.astype(np.float32), np.array(constants, np.float32)
         )
