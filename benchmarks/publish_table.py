@@ -29,6 +29,7 @@ from agents.workers import Interrupted
 from benchmarks.publish import commit
 from benchmarks.study import (
     CORE_HOURS,
+    EXPLORATION,
     NAVIGATION,
     NETWORKS,
     RANDOM,
@@ -186,10 +187,12 @@ def _page(
     )
     other = sum(state == "other" for state in states.values())
     unused = f"; {other} have other settings than today's, and aren't counted" if other else ""
+    few = len(RECIPES[next(iter(EXPLORATION))].seeds)
     yield "# Learned policies, measured\n"
     yield (
         f"Written by `python -m benchmarks.publish_table` on {date.today().isoformat()}, {commit()}. "
-        f"{missing}{unused}: {len(SEEDS)} training seeds of each kind. The trainings took {hours:.1f} hours of the "
+        f"{missing}{unused}: {len(SEEDS)} training seeds of each kind, {few} where exploration "
+        f"is compared. The trainings took {hours:.1f} hours of the "
         f"{CORE_HOURS:g} core hours that were planned (four hours of two cores), each on one of {os.cpu_count()} "
         f"shared cores ({platform.machine()}, no GPU), by the code of {commits or 'no commit yet'}. Agent-steps of "
         f"each: {steps}.\n"

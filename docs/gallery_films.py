@@ -91,7 +91,7 @@ GALLERY: Mapping[str, Episode] = {
         "leader_following",
         "consensus_paper",
         "Eight agents with unstable drifts meet; most task edges (dashed) join agents that don't communicate (solid). "
-        "Look at where they meet: the reward counts only their distances from each other, and every place is as good.",
+        "Look at where they meet: the reward counts distances and effort, and no place is better.",
         step=0.1,
         shown=120,
         duration=3.0,
