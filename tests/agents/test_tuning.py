@@ -76,10 +76,10 @@ def test_what_oscillates_over_a_network_is_tuned_for_it():
 
 def _over(network, environment, scenario):
     """Mean returns of `leader_following` with the parameters for networks, and with those for continuous exchange."""
-    env = batched(environment, scenario, num_envs=16, network=network)
+    env = batched(environment, scenario, num_envs=8, network=network)
     continuous = tuned_parameters(dataclasses.replace(describe(env), network=None), "leader_following")
     both = LawPolicy("leader_following"), LawPolicy("leader_following", continuous)
-    return [play(env, policy, range(16)).returns.mean() for policy in both]
+    return [play(env, policy, range(8)).returns.mean() for policy in both]
 
 
 def test_parameters_are_chosen_by_what_agents_know():
