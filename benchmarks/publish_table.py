@@ -233,8 +233,9 @@ def _method(tasks: Sequence[StudyTask], episodes: int) -> Iterator[str]:
     for name, recipe in RECIPES.items():
         settings = ", ".join(f"`{key}={value}`" for key, value in recipe.settings.items())
         settings += "".join(f"bounds fall at {play.rate:g} 1/s" for play in recipe.plays if play.rate is not None)
-        where = "all others" if name not in NAVIGATION else "navigation"
-        network = f"`{recipe.network}`" if recipe.network else "its scenario's network" if where == "navigation" else ""
+        having = [task.short for task in tasks if name in task.recipes]
+        where = "all but navigation" if len(having) == len(tasks) - 1 else ", ".join(having)
+        network = f"`{recipe.network}`" if recipe.network else "its scenario's network" if name in NAVIGATION else ""
         yield f"| {name} | {settings} | {network or 'continuous exchange'} | {where} |"
     yield f"\n{_networks()}\n"
     for task in tasks:

@@ -167,6 +167,12 @@ def findings(block: Block) -> Iterator[Finding]:
     yield against(
         "trained on the truth but played on estimates, against trained on estimates", "oracle", here, "estimate"
     )
+    if "critic on the state" in block.task.recipes:
+        yield against(
+            "with a critic on the true state, against one on estimates", "critic on the state", here, "estimate"
+        )
+        title = "with a critic on the true state, against learned on the truth"
+        yield against(title, "critic on the state", here, "oracle", "", Play("oracle"))
     yield against("with the guaranteed bounds, against without", "estimate + bounds", here, "estimate")
     title = f"learned on estimates, against the best tuned script on neighbours only ({best_local.name})"
     yield against(title, "estimate", here, best_local)
