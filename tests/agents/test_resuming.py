@@ -201,7 +201,7 @@ def test_ctrl_c_in_an_update(tmp_path, changes):
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "0.0\n"
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(3)  # until it is well in it
+        process.wait(1.5)  # until it is well in it
     process.send_signal(signal.SIGINT)
     try:
         output, _ = process.communicate(timeout=60)

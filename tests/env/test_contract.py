@@ -189,7 +189,7 @@ def test_writing_into_what_was_returned_changes_nothing(environment, name):
 @every
 def test_the_public_checks_pass(environment, name):
     """All of `check_environment`, over several episodes, with a lagging input and bounds."""
-    require_contract(partial(parallel, environment, name, max_cycles=30, actuator="lag", bounds=True), steps=75)
+    require_contract(partial(parallel, environment, name, max_cycles=20, actuator="lag", bounds=True), steps=50)
 
 
 @every
