@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.outcomes import interval95, wilson95
 from agents.tuned import OVER
-from benchmarks.study import CONTINUOUS, FAST, FILTER, LOSSY, NETWORKED, NETWORKS, SEEDS, Play
+from benchmarks.study import CONTINUOUS, FAST, FILTER, LOSSY, NETWORKED, NETWORKS, RECIPES, SEEDS, Play
 from benchmarks.study_measured import FLOORS, Block, Row
 from benchmarks.study_statistics import LEVEL, Difference, difference, iqm, iqm95, short
 from khop_env.observers import Exponential
@@ -137,7 +137,6 @@ def findings(block: Block) -> Iterator[Finding]:
     here, lossy = Play(), Play(network=LOSSY)
     best, best_local = block.best(here), block.best(Play("local"))
     leader = block.task.environment == "leader_following_v0"
-    on = {"": here, "ideal": Play(network="ideal"), "wifi": Play(network="wifi"), "lossy": lossy}
 
     def against(
         title: str, ours: str, where: Play, theirs: str | Row, aim: str = "", other: Play | None = None
@@ -154,10 +153,9 @@ def findings(block: Block) -> Iterator[Finding]:
     if "faster bounds" in block.task.recipes:
         title = f"with bounds that fall at {FAST:g} 1/s, against learned on the truth"
         yield against(title, "faster bounds", Play(rate=FAST), "oracle", WITHIN_FAST, Play("oracle"))
-    for play in dict.fromkeys(row.play for row in block.rows if row.play.rate is not None or row.play == here):
-        law = block.row(best.name, play)
-        title = f"{best.name} on estimates{_falling(play)}, against itself on the truth"
-        yield _compared(title, law, block.row(best.name, Play("oracle")), "")
+    for play in (here, Play(rate=FAST)):
+        title = f"{best.name} on estimates{_bounds(play)}, against itself on the truth"
+        yield against(title, best.name, play, best.name, "", Play("oracle"))
     yield against(f"learned on estimates, against {script}", "estimate", here, best, AT_LEAST)
     yield against(f"residual, against {script}", "residual", here, best, ON_TOP)
     for kind, aim in (("lossy", PAY), ("lossy attention", PAY_ATTENTION)):
@@ -184,7 +182,7 @@ def findings(block: Block) -> Iterator[Finding]:
     yield against("played lossy: trained on random networks, against trained ideal", "random", lossy, "ideal")
     yield against("played lossy: attention, against an MLP", "lossy attention", lossy, "lossy")
     for name in ("ideal", "wifi", "lossy", "lossy attention"):
-        reference = block.best(on[name.partition(" ")[0]])
+        reference = block.best(RECIPES[name].plays[0])  # on what it was trained
         yield against(f"{name}, against the best script there ({reference.name})", name, reference.play, reference)
 
 
@@ -261,10 +259,10 @@ def _label(row: Row, block: Block) -> str:
     """Name of a row of a task other than navigation; that of the best script stands out."""
     name = f"PPO {row.name}" if row.learned else f"**{row.name}**" if row is block.best(row.play) else row.name
     shown = row.play.network is not None or row.name in FLOORS or row.play.observe in row.name.split()
-    return name if shown else f"{name}, on {row.play.observe}{_falling(row.play)}"
+    return name if shown else f"{name}, on {row.play.observe}{_bounds(row.play)}"
 
 
-def _falling(play: Play) -> str:
+def _bounds(play: Play) -> str:
     return "" if play.rate is None else f", bounds at {play.rate:g} 1/s"
 
 
